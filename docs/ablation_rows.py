@@ -34,7 +34,7 @@ from rows import (
     scores,
     starred,
 )
-from step_rows import Steps, together
+from step_rows import Steps, refuse_busy, together
 
 from qsim.cli.options import count
 from qsim.files import read_json, write_bytes
@@ -69,6 +69,7 @@ def main(words: list[str] | None = None) -> int:
     try:
         args.work = keep_apart("ablation_rows", args.out, args.work, trial=args.tiny)
         if args.steps:
+            refuse_busy(args)
             args.work = args.work / f"{args.steps}_steps"
         for path in sorted(args.out.glob("*.json")):  # they share a table
             check_row(path, budget, args.data)

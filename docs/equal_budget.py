@@ -55,8 +55,9 @@ from quiver.restoration.interface import NETWORKS
 FORMAT = "quiver-equal-budget-3"
 CLASSICAL = ("moment:3", "moment", "transform-denoise", "qbp", "qbp-bm3d", "path-merge")
 FLOOR = "moment:3"  # a network below it is given no rank
-RATES = {"mergenet": ("5e-4", "1.5e-3")}
+RATES = {"mergenet": ("5e-4", "1.5e-3"), "rvrt": ("1e-4", "3e-4")}  # RVRT as published; at 1e-3 it stays the identity
 RATES_OF_OTHERS = ("3e-4", "1e-3")
+CROPS = {"rvrt": 128}  # px; it fills smaller ones to 132 px, which costs as much
 RECORD = "-1m"  # ends the names of the networks in the table of record
 ROWS = ("classical", *(name for name in NETWORKS if not name.endswith("-as-published")))
 INTERRUPTED = 130  # exit code of a command that was stopped from outside
@@ -205,10 +206,12 @@ def train(name: str, rate: str, folder: Path, data: Path, budget: Budget, *, sho
         "quiver": ["control", "--loss", "published"],
         "quiver-s": ["control", "--loss", "published"],
     }
+    design = name.removesuffix("-1m")
+    crop = max(budget.crop, CROPS.get(design, 0)) if budget.crop == Budget.crop else budget.crop
     quiver(
-        *("train", data, "-o", folder, "--preset", name, "--protocol", *own.get(name.removesuffix("-1m"), ["quick"])),
+        *("train", data, "-o", folder, "--preset", name, "--protocol", *own.get(design, ["quick"])),
         *budget.length(trial=short),
-        *("--optimiser", "adam", "--learning-rate", rate, "--crop", budget.crop, "--batch", budget.batch),
+        *("--optimiser", "adam", "--learning-rate", rate, "--crop", crop, "--batch", budget.batch),
         *("--sensor", "quiver-physical", "--ppp", LIGHTS[0], "--bits", 3, "-q"),
         budget=budget,
     )  # fmt: skip

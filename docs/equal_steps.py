@@ -20,7 +20,7 @@ from typing import Any
 
 from equal_budget import APART, FLOOR, HEADER, RECORD, ROWS, classical, learned, mean_of, score_cells
 from rows import LIGHTS, TINY, check_row, keep_apart, missing_rows, notes_on, options, scores
-from step_rows import Steps, together
+from step_rows import Steps, refuse_busy, together
 
 from qsim.cli.options import count
 from qsim.files import read_json, write_bytes
@@ -29,10 +29,10 @@ from qsim.tables import markdown_table
 FORMAT = "quiver-equal-steps-1"
 AT = f"{float(LIGHTS[0]):g} PPP, 3 bit"
 NAMES = tuple(name for name in ROWS if not name.endswith(RECORD) and not name.startswith(APART))
-LIMITS = f"""Every network saw the same number of windows, of 5 to 12 frames as its design takes. A large one needed more
-time for them: the table of [equal time](equal_budget.md) asks the other question. This is still a short training, so
-the order can change with a longer one. Frames: those of which one is restored, and how many of them lie ahead. Networks
-below {FLOOR} have no rank."""
+LIMITS = f"""Every network saw the same number of windows, with as many frames as its design takes. A large one needed
+more time for them: the table of [equal time](equal_budget.md) asks the other question. This is still a short training,
+so the order can change with a longer one. Frames: those of which one is restored, and how many of them lie ahead.
+Networks below {FLOOR} have no rank."""
 
 
 def main(words: list[str] | None = None) -> int:
@@ -46,6 +46,7 @@ def main(words: list[str] | None = None) -> int:
         print(f"equal_steps: no row is called {unknown[0]!r}; known are {', '.join(NAMES)}", file=sys.stderr)
         return 2
     try:
+        refuse_busy(args)
         args.work = keep_apart("equal_steps", args.out, args.work, trial=args.tiny) / f"{args.steps}_steps"
         for path in sorted(args.out.glob("*.json")):  # they share a table
             check_row(path, budget, args.data)

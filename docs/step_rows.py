@@ -45,6 +45,12 @@ class Steps(Budget):
         return (*PLACE, "--steps", self.steps, "--validate-every", self.interval)
 
 
+def refuse_busy(args: argparse.Namespace) -> None:
+    """Raise `ValueError` for an option that cannot act on rows of equal steps."""
+    if args.busy:
+        raise ValueError("--busy: rows of equal steps are made on any cores and never marked; leave it out")
+
+
 def together(program: str, makers: Mapping[str, Callable[[], dict[str, Any]]], args: argparse.Namespace,
              budget: Steps, page: Callable[[], None]) -> int:  # fmt: skip
     """Make the rows that are missing, each by its maker, then `page`; return 1 if one failed, 0 otherwise.

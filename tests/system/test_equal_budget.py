@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -284,6 +285,23 @@ def test_rows_of_the_ablation_are_made_once_and_shown(tmp_path, length):
 def test_networks_of_equal_steps_are_those_that_learn_from_clips_at_published_width():
     assert {*equal_steps.NAMES} >= {"classical", "unet", "quiver", "rvrt"}
     assert not [name for name in equal_steps.NAMES if name.startswith("bit2bit") or name.endswith(("-1m", "published"))]
+
+
+@pytest.mark.parametrize("program", [equal_steps, ablation_rows], ids=str)
+def test_busy_cores_are_no_option_of_equal_steps(program, tmp_path, capsys):
+    words = [str(tmp_path), "--steps", "2", "--tiny", "--busy", "--out", str(tmp_path / "r"), "--rows"]
+    assert program.main([*words, "unet" if program is equal_steps else "none"]) == 2
+    assert capsys.readouterr().err == (
+        f"{program.__name__}: --busy: rows of equal steps are made on any cores and never marked; leave it out\n"
+    )
+
+
+def test_rvrt_gets_crops_that_it_does_not_fill(tmp_path, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(equal_budget, "quiver", lambda *words, budget: asked.update(pairwise(words)))
+    for name, budget, crop in (("rvrt", rows.Budget(), 128), ("unet", rows.Budget(), 80), ("rvrt-1m", rows.TINY, 32)):
+        equal_budget.train(name, "1e-4", tmp_path, tmp_path, budget)
+        assert asked["--crop"] == crop
 
 
 def test_a_trial_has_a_sixth_of_the_steps():
