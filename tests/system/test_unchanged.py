@@ -4,8 +4,9 @@ Made once, by `python tests/system/test_unchanged.py --write`, from commit 19b9b
 failing test pass: a failing test says that results changed. Two parts followed changes that were meant: what
 `quiver-physical` gives where its gain is now 1 (below (2^b - 1) / 2 photons), and QBP, where the first of two equally
 good shifts is now taken; all other results stayed. Methods with BM3D are compared where their windows are complete,
-with what commit 4923285 computed: near the ends of a clip they now know that reflected frames count several times. The
-numbers of `nano` went with that network, and the checksum of a clip's clip.json left the records of jobs: that file
+with what commit 4923285 computed: near the ends of a clip they know that reflected frames count several times.
+Calibrations of counters are compared with commit 75e07fe: dark frames have the dead time of their own exposure.
+The numbers of `nano` went with that network, and the checksum of a clip's clip.json left the records of jobs: that file
 now tells neighbours, quality and another estimate of the error, while frames and streams stayed. Only names that
 survive every move are used: those of `import qsim`, `quiver.restore`, and the command lines.
 
