@@ -348,7 +348,7 @@ def interval(found: dict[str, Any], digits: int) -> str:
     if found["mean"] is None:
         return "n/a"
     half = "" if found["half_width"] is None else f" ± {found['half_width']:.{digits}f}"
-    return f"{found['mean']:.{digits}f}{half}"
+    return f"{float(found['mean']):.{digits}f}{half}"  # "inf" is text in JSON
 
 
 if __name__ == "__main__":

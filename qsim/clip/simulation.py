@@ -297,14 +297,18 @@ def stored(stream: Stream) -> Draw:
 
 
 def same_settings(old: dict[str, Any], new: dict[str, Any]) -> bool:
-    """Return whether two descriptions of streams have the same settings; folders of files do not count."""
+    """Return whether two descriptions of streams have the same settings; folders of files do not count, nor do the
+    stated effects of dead time: `drawn_by` tells what they led to.
+    """
     old, new = _without_folders(old), _without_folders(new)
+    new.pop("dead_time_effects", None)
     same = all(old.get(key, value if key == "drawn_by" else None) == value for key, value in new.items())
     return same and all(old.get(key) == new.get(key) for key in ("defects", "rows", "colour", "exposures", "origin"))
 
 
 def _without_folders(meta: dict[str, Any]) -> dict[str, Any]:
-    """Return a description in which a sensor file has its name alone, and measured maps have their checksums."""
+    """Return a copy of a description: a sensor file has its name alone, measured maps have their checksums."""
+    meta = dict(meta)
     name, table = meta.get("sensor_name"), meta.get("defects")
     if isinstance(name, str) and name.endswith(".toml"):
         meta = meta | {"sensor_name": Path(name).name}

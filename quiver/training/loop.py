@@ -32,7 +32,7 @@ from quiver.evaluation import metrics
 from quiver.model.removed import refuse_run
 from quiver.training.optimiser import Optimiser
 from quiver.training.processes import Process, begin_worker, joined, plain_errors
-from quiver.training.run_folder import Run
+from quiver.training.run_folder import Run, recorded_condition
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
 from quiver.training.self_supervised import make_stream_windows
 from quiver.training.settings import Settings, settled
@@ -277,6 +277,10 @@ def train(
         asked, system = settings.threads, system_of(model)
         system.refuse(model, settings)
         refuse_run(Path(settings.out), replaced=force)
+        validated = system.validated(model, settings)
+        if not force:  # a run of an earlier version ends as it began
+            began = (Path(settings.out), "validated_frames", validated, system.window(model))
+            validated = recorded_condition(*began)
         windows: AnyWindows
         fixed: Subset[dict[str, Any]] | None = None
         if system.of_stream:
@@ -286,11 +290,10 @@ def train(
         else:
             settings, lines = settled(settings, force=force)
             settings = replace(settings, threads=threads.use(asked, settings.threads).number)
-            windows, fixed = make_windows(settings, system.side(model), system, system.validated(model, settings))
+            windows, fixed = make_windows(settings, system.side(model), system, validated)
             lines += unfinished(settings.folders)
         conditions = {"processes": process.world, "computes_in": precision_of(settings, process.device)}
-        conditions |= {"clips": source_digest(windows, fixed), "validated_frames": system.validated(model, settings)}
-        run = Run(settings, conditions, earlier={"validated_frames": system.window(model)})
+        run = Run(settings, conditions | {"clips": source_digest(windows, fixed), "validated_frames": validated})
         if process.leads:
             stack.enter_context(run.open(force=force))
         process.wait()

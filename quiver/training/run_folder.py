@@ -80,16 +80,17 @@ def empty(folder: Path) -> None:
             path.unlink()
 
 
-class Run:
-    """Folder of a run. `conditions` are values by the keys of CONDITIONS, stored beside the settings; `earlier` those
-    of runs of versions that wrote none.
-    """
+def recorded_condition(folder: Path, name: str, now: Any, earlier: Any) -> Any:
+    """Return a condition of the run in a folder, `earlier` if its version wrote none, `now` where there is no run."""
+    path = folder / "settings.json"
+    return read_json(path).get(name, earlier) if path.is_file() else now
 
-    def __init__(
-        self, settings: Settings, conditions: Mapping[str, Any] | None = None, earlier: Mapping[str, Any] | None = None
-    ) -> None:
+
+class Run:
+    """Folder of a run. `conditions` are values by the keys of CONDITIONS, stored beside the settings."""
+
+    def __init__(self, settings: Settings, conditions: Mapping[str, Any] | None = None) -> None:
         self.settings, self.folder, self.conditions = settings, Path(settings.out), dict(conditions or {})
-        self.earlier = dict(earlier or {})
         self.checkpoint = self.folder / "checkpoint.pt"
 
     @contextlib.contextmanager
@@ -135,7 +136,7 @@ class Run:
                     "another -o, or start again with --force"
                 )
         for name, value in self.conditions.items():
-            before = found.get(name, self.earlier.get(name, value))
+            before = found.get(name, value)  # earlier versions wrote none
             if before != value:
                 raise FileExistsError(
                     f"{self.folder} {CONDITIONS[name].format(short(before), short(value))}; resume it as it began, "

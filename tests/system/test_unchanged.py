@@ -5,7 +5,7 @@ failing test pass: a failing test says that results changed. Two parts followed 
 `quiver-physical` gives where its gain is now 1 (below (2^b - 1) / 2 photons), and QBP, where the first of two equally
 good shifts is now taken; all other results stayed. Methods with BM3D are compared where their windows are complete,
 with what commit 4923285 computed: near the ends of a clip they know that reflected frames count several times.
-Calibrations of counters are compared with commit 75e07fe: dark frames have the dead time of their own exposure.
+Calibrations of counters are compared with commit 75e07fe, which takes the exposure of dark frames into account.
 The numbers of `nano` went with that network, and the checksum of a clip's clip.json left the records of jobs: that file
 now tells neighbours, quality and another estimate of the error, while frames and streams stayed. Only names that
 survive every move are used: those of `import qsim`, `quiver.restore`, and the command lines.

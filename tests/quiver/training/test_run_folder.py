@@ -26,7 +26,7 @@ from quiver.cli.program import main
 from quiver.model.unet import UNet, UNetConfig
 from quiver.training.loop import train
 from quiver.training.optimiser import Optimiser
-from quiver.training.run_folder import Run
+from quiver.training.run_folder import Run, recorded_condition
 from quiver.training.schedule import State
 from quiver.training.settings import Settings
 
@@ -85,11 +85,14 @@ def test_other_conditions_are_refused(tmp_path, name, began, now, says):
     opened(Settings("d", str(tmp_path / "old"), steps=1))  # of an earlier version, which stored none
     with Run(Settings("d", str(tmp_path / "old"), steps=1), {name: now}).open():
         pass
-    with (
-        pytest.raises(FileExistsError, match=says),  # where it is known what earlier versions did
-        Run(Settings("d", str(tmp_path / "old"), steps=1), {name: now}, earlier={name: began}).open(),
-    ):
+
+
+def test_a_run_of_an_earlier_version_is_validated_as_it_began(tmp_path):
+    opened(Settings("d", str(tmp_path / "old"), steps=1))
+    with Run(Settings("d", str(tmp_path / "new"), steps=1), {"validated_frames": 24}).open():
         pass
+    asked = [(tmp_path / name, "validated_frames", 40, 11) for name in ("old", "new", "none")]
+    assert [recorded_condition(*words) for words in asked] == [11, 24, 40]
 
 
 def test_one_process_at_a_time_trains_in_a_folder(tiny_dataset, tmp_path):
