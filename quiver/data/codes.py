@@ -320,4 +320,4 @@ def windows_sensed(clip: Clip, light: Illumination, seed: int, centres: range) -
             clip.exposure,
             Key(seed=seed, clip=hash_name(clip.name), stage=WINDOW_STAGE + t),
         )
-        yield array_codes(codes, sensor, clip.exposure, name=f"{clip.name} window {t}")
+        yield array_codes(codes, sensor, clip.exposure, name=f"{clip.name} window {t}", source=str(clip.path))

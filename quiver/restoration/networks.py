@@ -81,13 +81,12 @@ def wrap_network(
         run, window, look_ahead, together = fill_parts, part.past + 1 + part.future, part.future, part.kept
         description = f"{description}; look-ahead {look_ahead} frames"
 
-    told: set[str] = set()  # streams whose light was too bright: blocks and places of a mask are told once
+    told: set[str] = set()  # sources whose light was too bright: blocks, windows and places of a mask are told once
 
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
         run(model, codes, out, first, options, progress)
-        stream = codes.name.partition(" window ")[0].partition(", ")[0]  # not its window or its place of a mask
-        if run is not fill_merged and stream not in told and (text := excess(codes, out, first)):
-            told.add(stream)
+        if run is not fill_merged and codes.source not in told and (text := excess(codes, out, first)):
+            told.add(codes.source)
             warnings.warn(text, stacklevel=2)
 
     identity = {"weights_sha256": weights_sha256, "mode": mode, "precision": options.precision}

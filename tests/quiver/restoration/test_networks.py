@@ -226,7 +226,7 @@ def test_light_that_no_codes_can_mean_is_told():
         grown.restore(codes, 3, 4)
     grown.restore(codes, 4, 6)  # it was told
     with pytest.warns(UserWarning, match="above 10 times first in frame 0"):  # another stream is told again
-        grown.restore(replace(codes, name="other"))
+        grown.restore(replace(codes, source="other"))
     assert wrap_network(Growing(9 / 64), "q", "", cpu).restore(codes).max() == pytest.approx(9 * codes.white)
     bright = replace(array_codes(np.ones((6, 8, 8), np.uint8), BinarySPAD(1.0, 0.0, 1), 1e-3), ppp=10.0)
     assert wrap_network(Growing(200 / 64), "q", "", cpu).restore(bright).max() == pytest.approx(200)  # its peak is 25
