@@ -65,7 +65,8 @@ LIMITS = """Thirty minutes cannot tell which network is best after days of train
 the same time, and recurrent ones learn late. A row states what a design gives for this budget on these clips. All
 networks are trained by Adam, mergenet too, whose own protocol has Muon. bit2bit trains on the streams that it restores
 and stands apart. The speed of the machine differed from row to row: one with a slower reference convolution made fewer
-steps than it could."""
+steps than it could. An earlier version of this program made the rows flornn-1m (windows of eleven frames) and rvrt-1m
+(crops of 80 px, higher rates)."""
 APART = "bit2bit"  # begins the names of networks that learn from the streams they restore
 
 
@@ -207,7 +208,7 @@ def train(name: str, rate: str, folder: Path, data: Path, budget: Budget, *, sho
         "quiver-s": ["control", "--loss", "published"],
     }
     design = name.removesuffix("-1m")
-    crop = max(budget.crop, CROPS.get(design, 0)) if budget.crop == Budget.crop else budget.crop
+    crop = CROPS.get(design, budget.crop) if budget.crop == Budget.crop else budget.crop  # trials have small ones
     quiver(
         *("train", data, "-o", folder, "--preset", name, "--protocol", *own.get(design, ["quick"])),
         *budget.length(trial=short),

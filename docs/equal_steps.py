@@ -1,6 +1,6 @@
 """Trains every network of published width for the same number of steps, all at once, as one GPU can.
 
-    python docs/equal_steps.py out/starter --steps 500                      # the rows that are missing
+    python docs/equal_steps.py out/starter --steps 400                      # the rows that are missing
     python docs/equal_steps.py out/tiny --steps 2 --tiny --out out/rows     # a test of this program
 
 A row is RESULTS/NAME.json. It is written when it is complete and made once. Two trials with a sixth of the steps choose
