@@ -1,7 +1,7 @@
 """Restores by Quanta Burst Photography, with or without BM3D: aligns frames, merges them, inverts the response.
 
     codes -> matching images -> shifts per 16x16 patch -> Wiener merge of patch spectra -> mean code -> mu^-1 -> photons
-    with BM3D: mean code -> f -> BM3D with sigma = excess / sqrt(window) -> D^-1 -> photons
+    with BM3D: mean code -> f -> BM3D with sigma = excess / sqrt(frames) -> D^-1 -> photons
 
 Source: Ma, Gupta, Ulku, Bruschini, Charbon, Gupta, "Quanta Burst Photography", ACM TOG 39(4), 2020; written from the
 description. Our reading for few-bit streams: every frame is one block, and the response is inverted by its exact table.
@@ -13,14 +13,16 @@ photons per pixel.
 
 The window slides over the clip, so its frames are aligned again for each restored frame.
 
+Near the ends of a clip a window holds fewer frames. None is invented: a moving scene does not come back.
+
 The denoising step uses the stabiliser and the unbiased inverse of vst.py in place of the binomial Anscombe transform.
-Where the Wiener merge gives a frame a low weight, fewer than `window` codes are averaged: `excess` is the deviation of
-the noise over that of a full average. Near the ends of a clip reflected frames count several times: the deviation and
-the inverse are those of such a mean.
+Where the Wiener merge gives a frame a low weight, fewer codes are averaged than the window holds: `excess` is the
+deviation of the noise over that of a full average.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -31,7 +33,7 @@ from qsim.sensor.estimation import Response
 from qsim.sensor.sensor import Sensor
 from quiver.baselines import bm3d, patch_alignment
 from quiver.baselines.arrays import add_at, mixed, single, whole, xp, zeros
-from quiver.baselines.sliding_window import check_codes, check_window, frame_times, in_units, window_frames
+from quiver.baselines.sliding_window import check_codes, check_window, in_units, look_ahead
 from quiver.baselines.vst import stabiliser
 
 if TYPE_CHECKING:
@@ -83,11 +85,11 @@ def restore(
     frames = range(len(codes)) if frames is None else frames
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     for i, frame in enumerate(frames):
-        merged = merge(codes, frame, table, window, settings)
+        merged, count = merge(codes, frame, table, window, settings), len(_present(frame, window, len(codes)))
         if excess is None:
-            restored[i] = table.invert(merged, window)
+            restored[i] = table.invert(merged, count)
         else:
-            transform = stabiliser(sensor, exposure, frame_times(frame, window, len(codes)))
+            transform = stabiliser(sensor, exposure, (1,) * count)
             stable = transform.forward(merged)
             restored[i] = transform.inverse(bm3d.denoise(stable, excess * transform.deviation, peak=transform.peak))
     return in_units(restored, photons_per_unit)
@@ -98,44 +100,79 @@ def merge(codes: Array, frame: int, table: Response, window: int, settings: Sett
     check_window(window)
     if window % settings.block:
         raise ValueError(f"window is {window} frames, which blocks of {settings.block} do not divide")
-    height, width = codes.shape[1:]
-    stack = codes[window_frames(frame, window, len(codes))].astype(np.float32) / table.top
+    here, start = _present(frame, window, len(codes)), frame - window // 2
+    stack = codes[here.start : here.stop].astype(np.float32) / table.top
     frames = xp.stack([patch_alignment.pad_image(image) for image in single(stack)])
-    frames = frames.reshape(-1, settings.block, *frames.shape[1:])  # [blocks, frames of a block, H, W]
-    merged = _merge_patches(frames, frame_shifts(frames, settings), table, settings)
+    places = range(start - here.start, start - here.start + window)
+    shifts = frame_shifts(frames, places, settings)
+    blocks = [slice(block.start, block.stop) for block in _blocks(len(frames), places, settings.block)]
+    middle = next(i for i, block in enumerate(blocks) if block.stop > frame - here.start)
+    merged = _merge_patches([(frames[block], shifts[block]) for block in blocks], middle, table, settings)
+    height, width = codes.shape[1:]
     return np.asarray(table.top * merged[:height, :width])
 
 
-def frame_shifts(frames: Tensor, settings: Settings = CALIBRATED) -> Tensor:
-    """Return shifts [D, F, 2, N] of the patches of the middle block in every frame of D blocks [D, F, H, W].
+def _present(frame: int, window: int, length: int) -> range:
+    """Return the frames of a clip of `length` frames that lie in the window around one of them."""
+    return range(max(0, frame - window // 2), min(length, frame + look_ahead(window) + 1))
 
-    Means of `prefilter` blocks are matched where they share no frame with the middle block: shared noise would pull
-    shifts to zero. Other frames follow linearly in time between matched ones, and at constant speed beyond the last.
+
+def _blocks(count: int, window: range, size: int) -> list[range]:
+    """Return the blocks of `size` frames of a window, cut to the `count` frames that are present."""
+    ends = sorted({max(0, min(count, end)) for end in range(window.start, window.stop + 1, size)})
+    return [range(*pair) for pair in itertools.pairwise(ends)]
+
+
+def frame_shifts(frames: Tensor, window: range, settings: Settings = CALIBRATED) -> Tensor:
+    """Return shifts [K, 2, N] of the patches of the middle frame of a window in each of K frames [K, H, W].
+
+    `window` holds the places of its frames; those below 0 and from K on lie beyond the ends of the clip. Means of
+    blocks are matched (`_matched`). Shifts follow linearly in time between them, and at constant speed beyond.
     """
-    blocks, middle = frames.mean(1), len(frames) // 2
-    width = settings.prefilter if len(frames) >= 3 * settings.prefilter else 1
-    half = width // 2
-    matched = [i for i in range(half, len(frames) - half) if i == middle or abs(i - middle) >= width]
-    pyramids = {i: patch_alignment.pyramid(blocks[i - half : i + half + 1].mean(0)) for i in matched}
-    still = zeros(*patch_alignment.grid(blocks.shape[1:], patch_alignment.LEVELS[0])[0].shape)
-    found = [
-        still
-        if i == middle
-        else patch_alignment.align(pyramids[middle], pyramids[i], refine_finest=settings.refine_finest)
-        for i in matched
+    found, middle = _matched(len(frames), window, settings), window[len(window) // 2]
+    pyramids = [patch_alignment.pyramid(frames[span.start : span.stop].mean(0)) for span in found]
+    own = next(i for i, span in enumerate(found) if middle in span)
+    still = zeros(*patch_alignment.grid(frames.shape[1:], patch_alignment.LEVELS[0])[0].shape)
+    moves = [
+        still if i == own else patch_alignment.align(pyramids[own], other, refine_finest=settings.refine_finest)
+        for i, other in enumerate(pyramids)
     ]
-    count, block = frames.shape[:2]
-    place = (single(xp.arange(count * block)) + 0.5) / block - 0.5  # of a frame, in blocks
-    shifts = _interpolate(place - middle, single(matched) - middle, xp.stack(found))
-    return shifts.reshape(count, block, *still.shape)
+    times = single([(span.start + span.stop - 1) / 2 for span in found])
+    shifts = _interpolate(single(xp.arange(len(frames))) - times[own], times - times[own], xp.stack(moves))
+    return shifts - shifts[middle]
+
+
+def _matched(count: int, window: range, settings: Settings) -> list[range]:
+    """Return which of `count` frames are averaged for matching, in rising order; one range holds the middle frame.
+
+    A range has `prefilter` blocks and shares no frame with that of the middle: shared noise would pull shifts to zero.
+    In a window that is not complete, ranges are cut at its ends, since few are left. Short windows, and those in which
+    nothing else could be matched, take single blocks.
+    """
+    blocks = _blocks(count, window, settings.block)
+    middle = next(i for i, block in enumerate(blocks) if window[len(window) // 2] in block)
+    complete = count == len(window)
+
+    def spans(half: int) -> list[range]:
+        cut = {i: range(max(0, i - half), min(len(blocks), i + half + 1)) for i in range(len(blocks))}
+        whole = [span for span in cut.values() if len(span) > 2 * half or not complete]
+        others = [span for span in whole if span.stop <= cut[middle].start or span.start >= cut[middle].stop]
+        return sorted([cut[middle], *others], key=lambda span: (span.start, span.stop))
+
+    found = spans(settings.prefilter // 2 if len(window) >= 3 * settings.prefilter * settings.block else 0)
+    return [range(blocks[span[0]].start, blocks[span[-1]].stop) for span in (found if len(found) > 1 else spans(0))]
 
 
 def _interpolate(place: Tensor, known: Tensor, values: Tensor) -> Tensor:
     """Return shifts at other times from shifts [K, ...] at rising times [K], one of them 0: linear, in proportion
-    beyond.
+    beyond, and at the speed of the other side where one side has none.
     """
     if len(known) == 1:
         return xp.broadcast_to(values, (len(place), *values.shape[1:]))
+    if known[0] == 0:
+        known, values = xp.concat([-known[1:2], known]), xp.concat([-values[1:2], values])
+    elif known[-1] == 0:
+        known, values = xp.concat([known, -known[-2:-1]]), xp.concat([values, -values[-2:-1]])
     within = xp.clip(place, float(known[0]), float(known[-1]))
     right = xp.clip(xp.searchsorted(known, within), 1, len(known) - 1)
     share = (within - known[right - 1]) / (known[right] - known[right - 1])
@@ -163,34 +200,37 @@ def _warp_block(frames: Tensor, shifts: Tensor, corner: Tensor, smooth: bool) ->
     return xp.where(count > 0, total / xp.clip(count, 1, None), edge / len(frames))
 
 
-def _merge_patches(frames: Tensor, shifts: Tensor, table: Response, settings: Settings) -> Tensor:
-    """Return the merged image from aligned patches: spectra, Wiener weights, overlap-add."""
-    corner = patch_alignment.grid(frames.shape[2:], patch_alignment.LEVELS[0])[0]
-    size, count = patch_alignment.LEVELS[0].patch, len(frames)
-    smooth = settings.refine_finest
-    reference = _warp_block(frames[count // 2], shifts[count // 2], corner, smooth)
-    noise = 2 * size * size * settings.wiener * _noise(reference, table, settings)
+def _merge_patches(blocks: list[tuple[Tensor, Tensor]], middle: int, table: Response, settings: Settings) -> Tensor:
+    """Return the merged image from blocks of frames [F, H, W] and shifts [F, 2, N]: aligned patches, spectra, Wiener
+    weights, overlap-add. Blocks count by their frames.
+    """
+    shape, counts = blocks[0][0].shape[1:], [len(frames) for frames, _ in blocks]
+    corner = patch_alignment.grid(shape, patch_alignment.LEVELS[0])[0]
+    size, own, smooth = patch_alignment.LEVELS[0].patch, counts[middle], settings.refine_finest
+    reference = _warp_block(*blocks[middle], corner, smooth)
+    noise = size * size * settings.wiener * _noise(reference, own, table, settings)
     spectrum = xp.fft.rfft2(reference, None, (0, 1))
-    total = spectrum + 0
-    for i in range(count):
-        if i == count // 2:
+    total = own * spectrum
+    for i, (count, block) in enumerate(zip(counts, blocks, strict=True)):
+        if i == middle:
             continue
-        other = xp.fft.rfft2(_warp_block(frames[i], shifts[i], corner, smooth), None, (0, 1))
+        other = xp.fft.rfft2(_warp_block(*block, corner, smooth), None, (0, 1))
         other -= spectrum
         power = xp.square(other.real) + xp.square(other.imag)
-        total += spectrum + other * (noise / (power + noise))  # A F0 + (1 - A) Fz, A = power / (power + noise)
-    patches = xp.fft.irfft2(total / count, (size, size), (0, 1))
-    return xp.clip(overlap_add(patches, corner, frames.shape[2:]), 0, None)
+        both = noise * (1 + own / count)  # of the difference
+        total += count * (spectrum + other * (both / (power + both)))  # A F0 + (1 - A) Fz, A = power / (power + both)
+    patches = xp.fft.irfft2(total / sum(counts), (size, size), (0, 1))
+    return xp.clip(overlap_add(patches, corner, shape), 0, None)
 
 
-def _noise(reference: Tensor, table: Response, settings: Settings) -> Tensor:
-    """Return the variance of a pixel of each reference patch [N], in units of the top code squared."""
+def _noise(reference: Tensor, frames: int, table: Response, settings: Settings) -> Tensor:
+    """Return the variance of a pixel of each reference patch [N], a mean of `frames`, in units of the top code squared."""
     size = len(reference)
     if settings.wiener_variance == "patch":
         spread = reference - reference.mean((0, 1))
         return xp.clip(xp.square(spread).sum((0, 1)) / (size**2 - 1), EPSILON, None)
     mean_code = np.asarray(table.top * reference.mean((0, 1)))
-    variance = np.interp(mean_code, table.mean, table.variance) / (settings.block * table.top**2)
+    variance = np.interp(mean_code, table.mean, table.variance) / (frames * table.top**2)
     return single(np.maximum(variance, EPSILON))
 
 

@@ -111,9 +111,9 @@ def ball_shifts(ppp, settings):
     corner = patch_alignment.grid(torch.Size((384, 192)), patch_alignment.LEVELS[0])[0]
     on_ball, on_plate = [], []
     for middle in (5, 7, 9):
-        stack = torch.from_numpy(codes[middle - 5 : middle + 6].astype(np.float32) / 7)[:, None]
-        stack = torch.stack([patch_alignment.pad_image(image) for image in stack[:, 0]])[:, None]
-        shifts = qbp.frame_shifts(stack, settings)[:, 0]
+        stack = torch.from_numpy(codes[middle - 5 : middle + 6].astype(np.float32) / 7)
+        stack = torch.stack([patch_alignment.pad_image(image) for image in stack])
+        shifts = qbp.frame_shifts(stack, range(11), settings)
         slope = np.abs(np.diff(light[middle], axis=0, append=light[middle][-1:])).astype(np.float32)
         slope = patch_alignment.pad_image(torch.from_numpy(slope))
         strength = patch_alignment.gather(slope, corner, 16).sum((0, 1))
@@ -135,6 +135,57 @@ def test_alignment_finds_the_speed_of_a_filmed_ball_at_3_photons():
     assert np.sqrt(np.mean(error[away != 0] ** 2)) < 0.25
     assert abs(np.polyfit(away, ball[:, 0], 1)[0] - BALL_SPEED) < 0.08
     assert np.abs(plate).max() < 0.25
+
+
+def test_matched_means_share_no_frame_with_the_middle_and_are_cut_where_the_clip_ends():
+    """Complete windows of 11, 7 and 21 frames in blocks of 7; then the first frames of a clip, and a short clip."""
+
+    def matched(count, window, **settings):
+        return [(span.start, span.stop) for span in qbp._matched(count, window, qbp.Settings(**settings))]
+
+    assert matched(11, range(11)) == [(0, 3), (1, 4), (4, 7), (7, 10), (8, 11)]
+    assert matched(7, range(7)) == [(i, i + 1) for i in range(7)]
+    assert matched(21, range(21), block=7) == [(0, 7), (7, 14), (14, 21)]
+    assert matched(6, range(-5, 6)) == [(0, 2), (2, 5), (3, 6), (4, 6)]
+    assert matched(7, range(-4, 7)) == [(0, 3), (3, 6), (4, 7), (5, 7)]
+    assert matched(4, range(-4, 7)) == [(0, 1), (1, 2), (2, 3), (3, 4)]  # three frames around 1 leave nothing
+    assert matched(8, range(-9, 12), block=7) == [(0, 5), (5, 8)]
+
+
+def test_shifts_near_the_ends_follow_the_motion():
+    """Noiseless pictures at constant speed, random windows that reach beyond the clip or not: 0.15 px.
+
+    Frames beyond the ends were reflections, and took the shift of the place that they filled. A single block has
+    nothing to be matched with.
+    """
+    rng, picture = np.random.default_rng(6), texture((64, 128))
+    for _ in range(24):
+        block = int(rng.choice([1, 1, 3]))
+        window, length = block * int(rng.integers(2, 12)), int(rng.integers(2, 12))
+        frame, speed = int(rng.integers(length)), rng.uniform(-2, 2, 2)
+        here = range(max(0, frame - window // 2), min(length, frame + (window - 1) // 2 + 1))
+        if len(here) <= block:
+            continue
+        places = range(frame - window // 2 - here.start, frame - window // 2 - here.start + window)
+        stack = torch.stack([view(picture, *(speed * (t - frame))) for t in here])
+        shifts = qbp.frame_shifts(stack, places, qbp.Settings(block=block))
+        corner = patch_alignment.grid(stack.shape[1:], patch_alignment.LEVELS[0])[0]
+        seen = [(corner[k] >= 24) & (corner[k] <= stack.shape[1 + k] - 40) for k in (0, 1)]
+        true = torch.tensor(np.outer(np.array(here) - frame, speed), dtype=torch.float32)[..., None]
+        error = (shifts - true)[..., seen[0] & seen[1]].abs().median(-1)[0].max()
+        assert error < 0.15, (block, window, length, frame, speed, error)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_the_first_and_last_frames_are_merged_along_their_motion(backwards):
+    """Six frames instead of eleven raise the error of noise to 11 / 6; a wrong shift of reflected frames raised it
+    to more than twice that of a frame in the middle.
+    """
+    light, sensor = moving(26.0, 11, 2.5, shape=(64, 128))[:: -1 if backwards else 1], quiver_physical(26.0)
+    codes = sensor.sample(light, EXPOSURE, key=Key(7, 8), engine="reference")
+    restored = qbp.restore(codes, sensor, EXPOSURE)
+    errors = np.mean((restored - light) ** 2, axis=(1, 2))
+    assert max(errors[0], errors[10]) < 11 / 6 * errors[5]
 
 
 def moving(photons, frames, speed, shape=(72, 88)):
