@@ -4,7 +4,8 @@
         -> restored [T, H, W], float32
 
 With a range `frames`, only these are restored, also from the frames around them. Any number of frames and any size is
-allowed; a clip is continued by reflection at both ends. METHODS is the complete list; the module of a method has its
+allowed; beyond its ends a clip is continued by reflection, but methods that follow motion take the frames that exist.
+METHODS is the complete list; the module of a method has its
 other settings. Path merge needs torch; QBP and BM3D use it where it is installed (arrays.py).
 """
 
@@ -83,15 +84,17 @@ METHODS: dict[str, Method] = {
             "stabilise, BM3D by the noise of each frame, exact unbiased inverse",
             1800,
         ),
-        Method("qbp", _qbp, 11, "align, Wiener merge, exact inverse response", 600),
+        Method("qbp", _qbp, 11, "align, Wiener merge of the frames that exist, exact inverse response", 600),
         Method(
             "qbp-bm3d",
             _qbp_bm3d,
             11,
-            "align, Wiener merge, stabilise, BM3D by the noise of each frame, exact unbiased inverse",
+            "align, Wiener merge of the frames that exist, stabilise, BM3D by their noise, exact unbiased inverse",
             1800,
         ),
-        Method("path-merge", _path_merge, 11, "merge along smooth paths, exact inverse response", 500),
+        Method(
+            "path-merge", _path_merge, 11, "merge the frames that exist along smooth paths, exact inverse response", 500
+        ),
         Method(
             "transform-denoise-published",
             _transform_denoise_published,
@@ -103,7 +106,7 @@ METHODS: dict[str, Method] = {
             "qbp-published",
             _qbp_published,
             11,
-            "QBP with the article's noise estimate and whole-pixel shifts",
+            "QBP of the frames that exist, with the article's noise estimate and whole-pixel shifts",
             600,
         ),
     )

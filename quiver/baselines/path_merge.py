@@ -185,5 +185,5 @@ def restore(
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     height, width = codes.shape[1:]
     for i, merged in enumerate(stream(lambda t: codes[t], len(codes), domain, window, frames)):
-        restored[i] = table.invert(merged.mean_code[:height, :width], window)
+        restored[i] = table.invert(merged.mean_code[:height, :width], merged.frames)
     return in_units(restored, photons_per_unit)

@@ -224,7 +224,9 @@ def _merge_patches(blocks: list[tuple[Tensor, Tensor]], middle: int, table: Resp
 
 
 def _noise(reference: Tensor, frames: int, table: Response, settings: Settings) -> Tensor:
-    """Return the variance of a pixel of each reference patch [N], a mean of `frames`, in units of the top code squared."""
+    """Return the variance of a pixel of each reference patch [N], in units of the top code squared; a patch is the mean
+    of this many frames.
+    """
     size = len(reference)
     if settings.wiener_variance == "patch":
         spread = reference - reference.mean((0, 1))

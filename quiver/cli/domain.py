@@ -33,17 +33,19 @@ def add_domain(sub: Any) -> None:
     )
     parser.add_argument("--ppp", type=numbers, help="mean photons per pixel and code, comma-separated (default 3.25)")
     parser.add_argument(
-        "--methods", type=words, help="classical methods, comma-separated (default all but `likelihood`)"
+        "--methods",
+        type=words,
+        help="classical methods, comma-separated (default naive, moment:3, transform-denoise, qbp, qbp-bm3d)",
     )
     parser.add_argument("--seed", type=checked(checks.seed), help="seed of the noise (default 0)")
-    add_running(parser)
+    add_running(parser, resumed=False)
     parser.add_argument("--force", action="store_true", help="measure existing cells again")
 
 
 def _run_domain(args: argparse.Namespace) -> int:
     from quiver import threads
     from quiver.model.weights import load, metadata_of
-    from quiver.restoration.domain import Domain, read_scope, table
+    from quiver.restoration.domain import TIE, Domain, read_scope, table
     from quiver.restoration.networks import network_restorer
     from quiver.restoration.restorers import weights_path
     from quiver.restoration.sources import refuse, refuse_idle
@@ -70,7 +72,8 @@ def _run_domain(args: argparse.Namespace) -> int:
     text = [
         *table(found),
         "",
-        f"{path.name}: at least as good as the best classical method in {wins} of {len(found.cells)} cells",
+        f"{path.name}: at least as good as the best classical method in {wins} of {len(found.cells)} cells (up to "
+        f"{TIE:g} dB less is a tie)",
     ]
     output(args, {"weights": str(path), "domain": found.to_dict()}, text)
     return 0

@@ -155,6 +155,7 @@ def _comparison(args: argparse.Namespace) -> Comparison:
 
     refuse(args, ("frames", "splits"), "belongs to --static COUNTS")
     _check_source(args)
+    check_free(args.output)
     if args.protocol is not None:
         return _published_test(args)
     if (Path(args.source) / "clip.json").exists() and args.split not in (None, "all"):
@@ -195,7 +196,6 @@ def _published_test(args: argparse.Namespace) -> Comparison:
     from quiver.evaluation.comparison import CLIPS, Comparison
 
     refuse_published(args)
-    check_free(args.output)
     folder = str(args.output / CLIPS)
     lights = tuple(Illumination("quiver-published", ppp, 3) for ppp in args.ppp or (3.25,))
     return Comparison(folder, None, lights, args.seed or 0, published=True, test_set=args.protocol)

@@ -29,7 +29,7 @@ def add_light(parser: argparse.ArgumentParser, several: bool, default: str = "3.
     whole = whole_numbers if several else count
     parser.add_argument("--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default quiver-physical)")
     parser.add_argument("--ppp", type=kind, help=f"mean photons per pixel and exposure (default {default}){many}")
-    parser.add_argument("--bits", type=whole, help="bits per code (default 3)")
+    parser.add_argument("--bits", type=whole, help="bits per code (default 3; of a .toml file its own)")
 
 
 def add_preset(parser: argparse.ArgumentParser, default: str, known: Sequence[str]) -> None:

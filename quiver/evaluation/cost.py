@@ -220,12 +220,15 @@ def _child(pipe: Any, case: CostCase, settings: CostSettings) -> None:
 
 
 def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[str]) -> list[CostCase]:
-    """Return all combinations; classical methods have one mode and precision, all networks but QUIVER one mode."""
+    """Return all combinations. Classical methods have one mode and precision, all networks but QUIVER one mode: those
+    of a case.
+    """
     cases = []
     for method in methods:
         classical = method.partition(":")[0] in METHODS
-        for mode in modes[:1] if classical or _has_one_mode(method) else modes:
-            cases += [CostCase(method, mode, precision) for precision in (precisions[:1] if classical else precisions)]
+        for mode in (CostCase.mode,) if classical or _has_one_mode(method) else modes:
+            chosen = (CostCase.precision,) if classical else precisions
+            cases += [CostCase(method, mode, precision) for precision in chosen]
     return cases
 
 

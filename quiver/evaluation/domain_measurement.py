@@ -33,6 +33,7 @@ from quiver.restoration.restorers import restorers
 
 CLASSICAL = ("naive", "moment:3", "transform-denoise", "qbp", "qbp-bm3d")
 SENSOR = "sensor file "  # + its name: the key of its SHA-256
+METHODS_ARE = "what the methods do"  # key of their descriptions, which change when results do
 CUT = "tiles of a frame"  # key of those that change results
 
 
@@ -89,7 +90,8 @@ def measure(
     network = network_restorer(weights, options)
     if any(method.learned for method in methods):
         raise ValueError(f"a network is measured against classical methods, got {', '.join(settings.methods)}")
-    shared = settings.to_dict() | _run_of(network, settings.clips) | _sensor_files(settings.lights)
+    shared = settings.to_dict() | {METHODS_ARE: [method.description for method in methods]}
+    shared |= _run_of(network, settings.clips) | _sensor_files(settings.lights)
     before = read_scope(weights, metadata_of(weights)).domain
     if before is not None and (changes := _changes(before.measured, shared)) and not force:
         changed = ", ".join(changes)
@@ -139,8 +141,10 @@ def _sensor_files(lights: Sequence[Illumination]) -> dict[str, object]:
 
 
 def _changes(measured: Mapping[str, object], shared: Mapping[str, object]) -> list[str]:
-    """Return the settings that differ. Sensor files and tiles that only one side states are no difference."""
-    one_sided = {key for key in measured.keys() ^ shared.keys() if key.startswith((SENSOR, CUT))}
+    """Return the settings that differ. Sensor files, tiles and descriptions of methods that only one side states are no
+    difference.
+    """
+    one_sided = {key for key in measured.keys() ^ shared.keys() if key.startswith((SENSOR, CUT, METHODS_ARE))}
     return [
         key
         for key in dict.fromkeys((*shared, *measured))

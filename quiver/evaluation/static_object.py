@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import nan
+from math import isnan, nan
 
 import numpy as np
 from numpy import ndarray as Array
@@ -135,7 +135,8 @@ def _score(method: Restorer, counts: Counts, chosen: Sequence[Array], bits: int,
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         return StaticScore(method.name, nan, nan, nan, nan, nan, failure=reason)
     raw, matched, measured, scale, above = (float(value) for value in found.mean(axis=0))
-    return StaticScore(method.name, raw, matched, float(found[:, 1].std()), measured, scale, above)
+    spread = float(found[:, 1].std()) if len(found) > 1 else nan
+    return StaticScore(method.name, raw, matched, spread, measured, scale, above)
 
 
 def markdown(counts: Counts, scores: Sequence[StaticScore], frames: int, bits: int, peak: float | None = None) -> str:
@@ -157,7 +158,8 @@ def markdown(counts: Counts, scores: Sequence[StaticScore], frames: int, bits: i
         if s.failure is not None:
             table.append([s.method, f"failed: {s.failure}", "", "", ""])
             continue
-        matched = f"{s.psnr_matched:.2f} ± {s.psnr_matched_spread:.2f}"
+        spread = "" if isnan(s.psnr_matched_spread) else f" ± {s.psnr_matched_spread:.2f}"
+        matched = f"{s.psnr_matched:.2f}{spread}"
         cells = [f"{s.psnr:.2f}", matched, f"{s.psnr_as_measured:.2f}", f"{s.scale:.3f}"]
         table.append([s.method, *("n/a" if cell.startswith("nan") else cell for cell in cells)])
     header = ("method", "PSNR", "PSNR matched", "matched, as measured", "factor")

@@ -2,9 +2,10 @@
 
     codes [T, H, W] -> restored photons [T, H, W], float32
 
-Restorers pad edges themselves: time by reflection, so that every frame is restored; space by repetition up to the
-multiple that a network needs. Where a frame exceeds the memory bound, less of it is computed at a time (pieces.py). No
-ground truth is needed. `restorer(NAME)` finds a classical method, shipped weights, a weights file or a training folder.
+Restorers restore every frame. They pad edges themselves: time by reflection or not at all, space by repetition up to
+the multiple that a network needs. Where a frame exceeds the memory bound, less of it is computed at a time (pieces.py).
+No ground truth is needed. `restorer(NAME)` finds a classical method, shipped weights, a weights file or a training
+folder.
 """
 
 from __future__ import annotations

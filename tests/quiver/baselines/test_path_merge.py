@@ -153,6 +153,14 @@ def test_any_size_and_any_number_of_frames(shape):
         assert restored[0] == pytest.approx(SENSOR.response(EXPOSURE).invert(codes[0], 11), rel=1e-6)
 
 
+def test_saturated_pixels_near_the_ends_saw_the_frames_that_exist():
+    """One saturated plane had the light of eleven."""
+    sensor, window = BinarySPAD(1.0, 0.0, 1), 11
+    for length, seen in ((1, 1), (20, 6)):
+        first = pm.restore(np.ones((length, 16, 16), np.uint8), sensor, EXPOSURE, window=window)[0]
+        np.testing.assert_allclose(first, sensor.response(EXPOSURE).cap(seen), rtol=1e-6)
+
+
 def test_frames_restored_alone_are_those_of_the_stream():
     codes = np.random.default_rng(1).integers(0, 8, (9, 16, 24)).astype(np.uint8)
     everything = pm.restore(codes, SENSOR, EXPOSURE, window=5)

@@ -273,8 +273,15 @@ def test_a_clip_is_not_evaluated_into_the_folder_of_its_clips(capsys, clip, make
     assert "is not an evaluation" in mistake(capsys, "evaluate", clip, *words[2:])
 
 
+def test_an_evaluation_does_not_stand_in_a_clip(capsys, make_clip):
+    own = make_clip()
+    said = mistake(capsys, "evaluate", own.path, "-o", own.path / "table", "--methods", "naive")
+    assert "is part of a clip" in said
+    assert not (own.path / "table").exists()
+
+
 def test_the_help_says_whose_threads_are_kept(capsys):
-    for command in (name for name in COMMANDS if name != "domain"):
+    for command in COMMANDS:
         text = " ".join(run(capsys, command, "--help")[1].split())
         kept = "resumed work keeps its number" in text
         assert kept == (command in ("train", "restore", "ablate")), command

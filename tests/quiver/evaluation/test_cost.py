@@ -51,6 +51,14 @@ def test_only_cases_that_differ_are_run():
     assert len([c for c in cases if c.method == "quiver-s"]) == 4
 
 
+def test_no_case_has_a_mode_or_precision_that_it_does_not_use():
+    """The table named bfloat16 and streaming beside methods that have neither."""
+    cases = cases_of(("moment", "unet", "quiver-s"), ("streaming",), ("bfloat16",))
+    assert [(case.mode, case.precision) for case in cases] == [
+        *(("exact", "float32"), ("exact", "bfloat16"), ("streaming", "bfloat16"))
+    ]
+
+
 def test_weights_of_a_folder_have_the_modes_of_their_network(tmp_path):
     for name, network in (("u", UNet(UNetConfig(2))), ("q", QUIVER(SMALL))):
         (tmp_path / name).mkdir()

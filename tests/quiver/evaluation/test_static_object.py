@@ -51,6 +51,16 @@ def test_flicker_is_divided_out():
     assert flat.psnr < found.psnr
 
 
+def test_one_split_has_no_spread():
+    """It was stated as 0.00 dB."""
+    counts, _ = static_counts(5.0, np.ones(30))
+    found = evaluate_static(counts, [restorer("moment")], splits=1)
+    assert math.isnan(found[0].psnr_matched_spread)
+    (line,) = [line for line in markdown(counts, found, 11, 3).splitlines() if line.startswith("| moment")]
+    assert "±" not in line
+    assert "n/a" not in line
+
+
 @pytest.mark.parametrize("name", ["moment:1", "moment:3", "state"])
 def test_a_frame_is_divided_by_the_light_of_the_frames_that_its_method_sees(name):
     """Much light, so that the best factor is that of the brightness; frames differ by a factor of two."""
