@@ -239,13 +239,13 @@ def check_version(path: Path, found: object, known: int) -> None:
 def check_ours(folder: Path, names: str) -> None:
     """Raise `FileExistsError` if a folder holds files whose relative paths do not match the pattern `names`.
 
-    Called before the folder is deleted: `--force` replaces only files that this program wrote.
+    Called before the folder is deleted: only files that this program wrote are replaced.
     """
     for item in sorted(folder.rglob("*")):
         relative = item.relative_to(folder).as_posix()
         if item.is_symlink() or not (item.is_dir() or re.fullmatch(rf"(?:{names})(?:\.tmp-.*)?", relative)):
             raise FileExistsError(
-                f"{item}: was not made by this program, and --force replaces only what it made; move it away, or name "
+                f"{item}: was not made by this program, which replaces only what it made; move it away, or name "
                 "another output"
             )
 

@@ -172,6 +172,8 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
     hints = Hints(args.layout, args.height, args.width, args.bits, transfer, args.channel, args.flip, args.columns,
                   args.stretched, args.variable, args.white)  # fmt: skip
     found = detection.recordings(args.input, args.layout)
+    if args.layout is None:
+        detection.check_one_kind(args.input, found)
     pairs = [(source, args.output / files.check_name(_flat_name(source, args.input))) for source in found]
     if pairs:
         _check_names(args.input, pairs)

@@ -12,6 +12,7 @@ from typing import Any
 
 from qsim import files
 from qsim.cli.console import bar, command, output, refuse_existing, refuse_idle
+from qsim.clip.manifest import check_outside
 
 PREVIEWS = (".mp4", ".gif", ".png")
 FASTEST_GIF = 50  # frames per second; viewers slow down faster ones
@@ -64,6 +65,7 @@ def _run_preview(args: argparse.Namespace) -> int:
                 f"--fps {args.fps:g}: a GIF plays at most {FASTEST_GIF} frames per second; write {target.stem}.mp4, "
                 f"or give --fps {FASTEST_GIF} or less"
             )
+        check_outside(target)
         refuse_existing(target, args.force)
         refuse_existing(preview.sidecar(target), args.force)
     if args.fps is not None and not 0.01 <= args.fps <= 1000:

@@ -185,6 +185,10 @@ class ClipFolder:
         """Whether flow, validity, depth and body indices were stored."""
         return "truth/000000.exr" in self.meta["checksums"]
 
+    def holds(self, channel: str) -> bool:
+        """Return whether the ground truth has a channel: u and v of flow, bu and bv of flow_back, valid, Z, id."""
+        return self.has_truth and channel in self._channels("truth", 0)
+
     def _half(self, folder: str, t: int, crop: Crop | None) -> Array:
         """Return an image of frame t in a folder, float32 [h, w] or [3, h, w]."""
         self._check_frame(t)
@@ -204,6 +208,14 @@ class ClipFolder:
 
     def _channel(self, folder: str, t: int, channel: str) -> Array:
         """Return a channel [H, W] of frame t in a folder."""
+        channels = self._channels(folder, t)
+        if channel not in channels:
+            path = self.path / folder / f"{t:06d}.exr"
+            raise ValueError(f"{path}: has no channel '{channel}' ({TRUTH.get(channel, channel)})")
+        return channels[channel]
+
+    def _channels(self, folder: str, t: int) -> dict[str, Array]:
+        """Return all channels [H, W] of frame t in a folder by name."""
         self._check_frame(t)
         path = self.path / folder / f"{t:06d}.exr"
         if not path.is_file():
@@ -211,10 +223,7 @@ class ClipFolder:
             why = f"the clip is damaged, run `qsim check {self.path}`" if kept else f"frame {t} has no ground truth"
             raise FileNotFoundError(f"{path}: no such file; {why}")
         status = path.stat()
-        channels = _read_truth(path, *self.shape[1:], status.st_mtime_ns, status.st_size)
-        if channel not in channels:
-            raise ValueError(f"{path}: has no channel '{channel}' ({TRUTH.get(channel, channel)})")
-        return channels[channel]
+        return _read_truth(path, *self.shape[1:], status.st_mtime_ns, status.st_size)
 
     def _check_frame(self, t: int) -> None:
         if not 0 <= t < len(self):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -86,3 +88,41 @@ def check_new(path: Path, meta: dict[str, Any]) -> None:
         raise ValueError(f"{path}: a clip in {PHYSICAL} needs a camera, and a relative one has none")
     if not structure.is_bands(meta.get("bands", [1.0, 1.0, 1.0])):
         raise ValueError(f"{path}: bands must be three wavelengths in m, got {meta['bands']!r}; leave them out for one")
+
+
+def target_of(path: str | os.PathLike[str], force: bool) -> Path:
+    """Return the folder that a clip of this path is written to: a symbolic link stays, and its target is written.
+
+    `FileExistsError` for a folder that may not be replaced, `NotADirectoryError` for a path below a file,
+    `PermissionError` for one below a folder that cannot be written.
+    """
+    found = Path(path)
+    files.check_name(found.name)
+    if found.is_symlink():
+        found = found.resolve()
+    if found.exists() and not force:
+        raise FileExistsError(f"{found}: exists; name another with -o, or use --force to replace it")
+    check_replaced(found)
+    above = next(parent for parent in found.absolute().parents if parent.exists())
+    if not above.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(found))
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise PermissionError(f"{found}: no permission to write into {above}; name another with -o")
+    return found
+
+
+def check_replaced(path: Path) -> None:
+    """Raise `FileExistsError` if something else than a clip, or a clip with other files in it, would be replaced."""
+    if path.exists() and not (path / "clip.json").is_file():
+        raise FileExistsError(
+            f"{path}: exists and is not a clip, which is all that --force replaces; name another with -o"
+        )
+    if path.exists():
+        files.check_ours(path, OURS)
+
+
+def check_outside(path: Path) -> None:
+    """Raise `FileExistsError` for an output in a clip or in its streams, where its .json would count as one."""
+    for above in path.absolute().parents[:2]:
+        if (above / "clip.json").is_file():
+            raise FileExistsError(f"{path}: lies in the clip {above}, which holds nothing else; name another place")

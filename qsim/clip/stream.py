@@ -124,15 +124,15 @@ class Stream:
         They are expected photons per pixel and exposure at mid-exposure, without blur. A code of several clip frames
         has the light of its middle one times their number. Where rows have their own time, each is that of the clip
         frame nearest to its mid-exposure; `at="frame"` takes all from the middle of the frame, undistorted by motion.
-        `ValueError` for frames that do not exist, `FileNotFoundError` for a stream without a clip.
+        `ValueError` for frames that do not exist and imported streams, `FileNotFoundError` for a stream without a clip.
         """
         if at not in ("row", "frame"):
             raise ValueError(f"{self.path}: truth at the time of each row or of the middle of the frame, got {at!r}")
         frames = self._existing(start, len(self) if stop is None else stop)
-        factor = self.photons_factor * self._planes
+        clip, factor = self.clip, self.photons_factor * self._planes
 
         def sharp(frame: int, crop: Crop | None = None) -> Array:
-            return clip_photons(self.clip, frame, factor, crop, sharp=True)
+            return clip_photons(clip, frame, factor, crop, sharp=True)
 
         return np.stack([self._at_mid_exposure(sharp, t, at) for t in frames])
 
@@ -149,8 +149,7 @@ class Stream:
     @cached_property
     def rows(self) -> Rows | None:
         """The delay of rows or columns; None: all are read at once."""
-        where = f"{self.path.with_suffix('.json')}: rows"
-        return from_dict(self.meta["rows"], where) if "rows" in self.meta else None
+        return from_dict(self.meta["rows"], f"{self.path.with_suffix('.json')}: rows") if "rows" in self.meta else None
 
     def require_even(self, what: str) -> None:
         """Raise `ValueError` if rows have their own time or codes different exposures, which `what` does not know."""
@@ -210,7 +209,9 @@ class Stream:
 
     @property
     def photons_factor(self) -> float:
-        """Photons at the sensor over the clip's expected photons."""
+        """Photons at the sensor over the clip's expected photons; `ValueError` for an imported stream."""
+        if self.meta["ppp_factor"] is None:
+            raise ValueError(f"{self.path}: was imported, so its light is not known")
         return float(self.meta["ppp_factor"])
 
     @cached_property
@@ -266,8 +267,7 @@ class Stream:
             return packing.unpack(np.asarray(self.packed[start:stop]), self.bits, width)
         y, x, h, w = check_crop(crop, height, width, str(self.path))
         # The packed bytes that hold the columns: from the last code that starts on a byte.
-        step = 8 // math.gcd(8, self.bits)
-        first = x // step * step
+        first = x - x % (8 // math.gcd(8, self.bits))
         low, high = first * self.bits // 8, packing.packed_width(x + w, self.bits)
         part = np.asarray(self.packed[start:stop, y : y + h, low:high])
         return packing.unpack(part, self.bits, x + w - first)[..., x - first :]

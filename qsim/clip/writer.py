@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import functools
 import importlib.metadata
 import json
@@ -20,7 +19,7 @@ from numpy import ndarray as Array
 
 from qsim import files, locks
 from qsim.clip import clamped_error, exr
-from qsim.clip.manifest import FORMAT_VERSION, MEASURED, OURS, TRUTH, camera_of, check_new
+from qsim.clip.manifest import FORMAT_VERSION, MEASURED, TRUTH, camera_of, check_new, check_replaced, target_of
 from qsim.colour import bright_end
 from qsim.files import VERSION, check_name
 from qsim.optics import radiometry
@@ -218,7 +217,10 @@ class ClipWriter:
         return half
 
     def _finish(self) -> None:
-        """Write clip.json and rename the folder; `ValueError` if a frame is missing."""
+        """Write clip.json and rename the folder; `ValueError` if a frame is missing.
+
+        `FileExistsError` if the clip, or something else, exists by now and may not be replaced; .part stays complete.
+        """
         frames = self.meta["shape"][0]
         missing = [t for t in range(frames) if not self.has(t)]
         if missing:
@@ -228,6 +230,12 @@ class ClipWriter:
         if not self._complete:
             self._check_light(frames)
             self._write_meta(frames)
+        if self.path.exists() and not self.force:
+            raise FileExistsError(
+                f"{self.path}: appeared while this clip was made, which is complete in {self.part.name}; move it away "
+                "and run the same command again"
+            )
+        check_replaced(self.path)
         for name in ("begun.json", "journal.jsonl", "lock"):
             (self.part / name).unlink(missing_ok=True)
         if self.path.exists():
@@ -274,32 +282,6 @@ class ClipWriter:
         paths = [self.part / "radiance" / f"{t:06d}.exr" for t in range(frames)]
         samples = [exr.read_half(path, height, width, colour=colour)[..., ::step, ::step] for path in paths]
         return bright_end(np.stack(samples))
-
-
-def target_of(path: str | os.PathLike[str], force: bool) -> Path:
-    """Return the folder that a clip of this path is written to: a symbolic link stays, and its target is written.
-
-    `FileExistsError` for a folder that may not be replaced, `NotADirectoryError` for a path below a file,
-    `PermissionError` for one below a folder that cannot be written.
-    """
-    found = Path(path)
-    check_name(found.name)
-    if found.is_symlink():
-        found = found.resolve()
-    if found.exists() and not force:
-        raise FileExistsError(f"{found}: exists; name another with -o, or use --force to replace it")
-    if found.exists() and not (found / "clip.json").is_file():
-        raise FileExistsError(
-            f"{found}: exists and is not a clip, which is all that --force replaces; name another with -o"
-        )
-    if found.exists():
-        files.check_ours(found, OURS)
-    above = next(parent for parent in found.absolute().parents if parent.exists())
-    if not above.is_dir():
-        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(found))
-    if not os.access(above, os.W_OK | os.X_OK):
-        raise PermissionError(f"{found}: no permission to write into {above}; name another with -o")
-    return found
 
 
 def _truth_channels(truth: dict[str, Array]) -> dict[str, Array]:

@@ -52,10 +52,11 @@ class Redrawn:
 def redraw(path: Path, progress: Progress | None = None) -> list[Redrawn]:
     """Draw one stream again, or every stream of a clip or a data set; `check` names the damaged ones.
 
-    `progress(done, total)` is called after each stream. `FileNotFoundError` or `ValueError` if there is none.
+    `progress(done, total)` is called after each stream. `FileNotFoundError` or `ValueError` if there is none. Restored
+    video has none, and its result is empty.
     """
     found = _streams(path)
-    if not found:
+    if not found and path.is_dir():
         raise ValueError(f"{path}: holds no stream to draw again")
     results = []
     for done, (clip, json_path, again) in enumerate(found, 1):
@@ -69,10 +70,10 @@ def _redrawn(place: Path, json_path: Path, dataset: Path | None) -> Redrawn:
     """Draw one stream of the clip at `place` again; `dataset` is the data set whose recipe made it, if any."""
     path = json_path.with_suffix(".npy")
     try:
-        clip, stream = Clip.open(place), Stream.open(json_path)
+        stream = Stream.open(json_path)
+        draw, clip = dataclasses.replace(stored(stream), engine="reference"), Clip.open(place)
         frames, height, width = stream.shape
         found = Redrawn(path, frames * height * width, cure=_cure(stream, dataset))
-        draw = dataclasses.replace(stored(stream), engine="reference")
         step = max(1, _BLOCK_PIXELS // (height * width * draw.planes))
         start = 0
         for block in draw.blocks(clip, 0, frames, step):
@@ -105,7 +106,10 @@ def _streams(path: Path) -> list[tuple[Path, Path, Path | None]]:
         if not (path / "clip.json").is_file():
             Clip.open(path)  # raises the error that names what is missing
         return _of_clip(path)
-    return [each for each in _of_clip(path.parent.parent) if each[1] == path.with_suffix(".json")]
+    described = path.with_suffix(".json")
+    if "ppp_factor" not in files.read_json(described):  # restored video
+        return []
+    return [(described.absolute().parents[1], described, None)]
 
 
 def _of_clip(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import files
+from qsim.clip import manifest
 from qsim.dataset.dataset import Dataset, verify_job
 from qsim.dataset.job import Job
 from qsim.dataset.job_runner import make_record, record_path
@@ -18,6 +19,7 @@ def repair_jobs(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
 
     The next run draws a damaged stream again and writes a damaged record again; every other damage costs a rendering.
     Streams that `qsim sense` added to a removed clip are lost, and each is named.
+    `FileExistsError` for a clip to remove that holds other files than ours.
     """
     entries = Dataset.open(folder).meta["jobs"]
     checked = [_damage(folder, job, entries[job.name]) for job in jobs if record_path(folder, job.name).is_file()]
@@ -29,6 +31,8 @@ def repair_jobs(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
                 f"{damage.problems[0]}; {clip} is a symbolic link to {os.readlink(clip)}, and --repair replaces no "
                 "links: move the folder back, or delete the link to have the clip made here"
             )
+        if clip.is_dir() and not damage.light:
+            files.check_ours(clip, manifest.OURS)
     return tuple(line for damage in taken for line in _take_back(folder, damage))
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from qsim import checks
 from qsim.clip.clip import Clip
-from qsim.clip.writer import target_of
+from qsim.clip.manifest import target_of
 from qsim.dataset import scene_files
 from qsim.files import NAME, Progress
 from qsim.rendering.budget import Budget

@@ -45,10 +45,11 @@ _CODECS = {"blosc", "bytes", "crc32c", "delta", "gzip", "lz4", "packbits", "shar
 def read_cube(path: Path, hints: Hints) -> Recording:
     """Read a photon cube: uint8 [T, H, ceil(W/8)], rows padded, most significant bit first; [.., C] needs a channel.
 
-    Without a given width, that of our description beside it counts; else every bit of the last byte is a pixel.
-    `ValueError` for another array.
+    Without a given width, that of our description beside it counts (in colour the meta.json of a challenge);
+    else every bit of the last byte is a pixel. `ValueError` for another array.
     """
     array = load_array(path)
+    description = "meta.json" if array.ndim == 4 else f"{path.name}.json"
     if array.ndim == 4:
         if hints.channel is None or not 0 <= hints.channel < array.shape[3]:
             raise ValueError(f"{path}: a colour cube of {array.shape[3]} channels; choose one with --channel 0")
@@ -56,7 +57,7 @@ def read_cube(path: Path, hints: Hints) -> Recording:
     if array.dtype != np.uint8 or array.ndim != 3:
         raise ValueError(f"{path}: a photon cube is uint8 [T, H, bytes], found {array.dtype} {list(array.shape)}")
     frames, height, columns = check_shape(path, array.shape)
-    width = hints.width if hints.width is not None else written_width(path) or 8 * columns
+    width = hints.width if hints.width is not None else written_width(path, description) or 8 * columns
     if not 8 * (columns - 1) < width <= 8 * columns:
         raise ValueError(f"{path}: {columns} bytes per row hold {8 * columns - 7} to {8 * columns} pixels, not {width}")
 
@@ -66,10 +67,10 @@ def read_cube(path: Path, hints: Hints) -> Recording:
     return Recording((frames, height, width), read, "photon cube", 1, meta={"bit_order": "msb"})
 
 
-def written_width(path: Path) -> int | None:
-    """Return the width in NAME.npy.json, if `qsim convert` wrote it beside a photon cube; else None."""
+def written_width(path: Path, description: str) -> int | None:
+    """Return the width in a description, NAME.npy.json, if `qsim convert` wrote it beside a photon cube; else None."""
     try:
-        found = files.read_json(path.with_name(f"{path.name}.json"))
+        found = files.read_json(path.with_name(description))
     except (OSError, ValueError):
         return None
     software, shape = found.get("software"), found.get("shape")

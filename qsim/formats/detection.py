@@ -60,13 +60,12 @@ def detect(path: Path, hints: Hints | None = None) -> str:
     if path.is_dir():
         return _detect_folder(path)
     suffix = "".join(path.suffixes[-2:]) if path.suffix == ".gz" else path.suffix.lower()
-    simple = {".png": "png", ".tif": "tiff", ".tiff": "tiff", ".mat": "mat", ".dat": "spike", ".npy.gz": "cube",
-              ".npz": "photons"}  # fmt: skip
+    simple = {".png": "png", ".tif": "tiff", ".tiff": "tiff", ".mat": "mat", ".dat": "spike", ".npz": "photons"}
     if suffix in simple:
         return simple[suffix]
     if suffix in VIDEOS:
         return "video"
-    if suffix == ".npy":
+    if suffix in (".npy", ".npy.gz"):
         return _detect_npy(path, hints or Hints())
     if suffix == ".bin":
         return _detect_raw(path)
@@ -91,6 +90,20 @@ def recordings(folder: Path, layout: str | None) -> list[Path]:
     kinds = (layout,) if layout else ("png", "tiff")
     places = {file.parent for file in files if PICTURES.get(file.suffix.lower()) in kinds}
     return sorted(place for place in places if not any(place.glob("*.npy")))
+
+
+def check_one_kind(folder: Path, found: list[Path]) -> None:
+    """Raise `ValueError` if a folder holds pictures or arrays beside the videos that were `found` in it."""
+    if not found or found[0].is_dir():
+        return
+    kinds = {*PARTS, ".dat"} - {".json"}  # exports have a .json beside them
+    files = [file for file in folder.rglob("*") if not file.name.startswith(".")]
+    others = sorted(file for file in files if file.suffix.lower() in kinds or file.name in ZARR)
+    if others:
+        raise ValueError(
+            f"{folder}: holds videos ({found[0]}) and other recordings ({others[0]}); choose with --layout, as in "
+            "--layout video or --layout png"
+        )
 
 
 def _detect_folder(path: Path) -> str:
@@ -118,7 +131,7 @@ def _detect_npy(path: Path, hints: Hints) -> str:
         return "light"
     if array.dtype != np.uint8:
         return "codes" if hints.bits is not None and array.dtype.kind == "u" else "light"
-    if array.ndim == 4 or hints.width is not None or array_files.written_width(path) is not None:
+    if array.ndim == 4 or hints.width is not None or array_files.written_width(path, f"{path.name}.json") is not None:
         return "cube"
     top = max((int(array[t].max()) for t in range(len(array)) if array[t].size), default=0)
     bits = max(top.bit_length(), 1)

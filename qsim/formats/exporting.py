@@ -13,6 +13,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.clip.clip import Clip
+from qsim.clip.manifest import check_outside
 from qsim.clip.stream import Stream, orientation
 from qsim.colour import code_levels, peak
 from qsim.files import VERSION
@@ -42,6 +43,7 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     if wanted.kind not in EXPORTS:
         raise ValueError(f"{path}: unknown kind {wanted.kind!r}; there are {', '.join(EXPORTS)}")
     check(source, wanted)
+    check_outside(path)
     if (path.exists() or path.is_symlink()) and not force:
         raise FileExistsError(f"{path}: exists; name another, or use --force to replace it")
     meta = _export_meta(source, wanted)
@@ -64,7 +66,10 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     except BaseException:
         shutil.rmtree(part)
         raise
-    if path.exists():
+    if path.exists():  # or it appeared meanwhile
+        if not force:
+            raise FileExistsError(f"{path}: appeared while it was written; move it away and run the same command again")
+        _check_ours(path, path / "meta.json", False)
         files.remove_folder(path)
     part.rename(path)
     files.sync_folder(path.parent)
@@ -224,8 +229,8 @@ EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
 def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
     meta = source.meta
     keys = ("shape", "frame_rate", "exposure", "radiance_unit", "scene", "split", "bits", "code_model", "sensor",
-            "seed", "ppp_target", "ppp_factor", "width", "planes_per_code", "rows", "exposures",
-            "bands", "colour")  # fmt: skip
+            "seed", "ppp", "ppp_target", "lux_target", "ppp_factor", "width", "planes_per_code", "rows", "exposures",
+            "bands", "colour", "defects", "origin", "diffraction")  # fmt: skip
     found = {key: meta[key] for key in keys if key in meta}
     found |= {"format_version": 1, "bit_order": "msb", "software": {"qsim": VERSION}}
     found["orientation"] = orientation(meta)

@@ -31,6 +31,9 @@ from qsim.formats.recording import (
     white_of,
 )
 
+_GREY_OR_RGB = (0, 1, 2, 32803, 34892)  # TIFF: MinIsWhite, MinIsBlack, RGB, and the grey of raw pixels (CFA, LinearRaw)
+_JPEG = (6, 7, 33007, 34892)  # compressions whose YCbCr becomes RGB when it is decoded
+
 
 def read_png(path: Path, hints: Hints) -> Recording:
     """Read a PNG, or a folder of PNGs in the order of their numbers; see `picture`."""
@@ -79,18 +82,22 @@ def _check_complete(folder: Path, pictures: list[Path]) -> None:
 
 
 def read_tiff(path: Path, hints: Hints) -> Recording:
-    """Read a TIFF with one page per frame, or a folder of TIFFs; MinIsWhite is converted to MinIsBlack."""
+    """Read a TIFF with one page per frame, or a folder of TIFFs; MinIsWhite is converted to MinIsBlack.
+
+    `ValueError` for other colours than grey and RGB, unless the pixels of a palette are codes (--bits).
+    """
     found = [path] if path.is_file() else numbered([*path.glob("*.tif"), *path.glob("*.tiff")])
     if not found:
         raise FileNotFoundError(f"{path}: holds no .tif or .tiff")
     counts = [_tiff_pages(file) for file in found]
     where = [(file, page) for file, count in zip(found, counts, strict=True) for page in range(count)]
-    first = _tiff(*where[0])
+    first = _tiff(*where[0], hints)
     shape = check_shape(path, (len(where), *first.shape[:2]))
 
     def raw(start: int, stop: int) -> Array:
         chosen = where[start:stop]
-        return _same_size([file for file, _ in chosen], [_tiff(*place) for place in chosen], first.shape, first.dtype)
+        pictures = [_tiff(*place, hints) for place in chosen]
+        return _same_size([file for file, _ in chosen], pictures, first.shape, first.dtype)
 
     return picture(path, shape, raw, first.dtype, "TIFF", hints)
 
@@ -195,12 +202,16 @@ def _tiff_pages(path: Path) -> int:
         return count
 
 
-def _tiff(path: Path, page: int) -> Array:
+def _tiff(path: Path, page: int, hints: Hints) -> Array:
     import tifffile
 
     with decoding_errors(path, "TIFF"), tifffile.TiffFile(path) as opened:
         found: Any = opened.pages[page]
         check_shape(path, (1, found.imagelength, found.imagewidth))
+        kind, packed = found.photometric, found.compression
+        codes = kind == tifffile.PHOTOMETRIC.PALETTE and hints.bits is not None  # stacks of ImageJ have a colour table
+        if not (kind in _GREY_OR_RGB or codes or (kind == tifffile.PHOTOMETRIC.YCBCR and packed in _JPEG)):
+            raise ValueError(f"{path}: page {page} holds {getattr(kind, 'name', kind)} pixels; save it as grey or RGB")
         promised, there = found.nbytes, path.stat().st_size
         if promised > 1032 * there or (found.compression == 1 and found.bitspersample >= 8 and promised > there):
             raise ValueError(f"{path}: page {page} states {promised} bytes, the file has {there}")

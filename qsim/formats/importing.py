@@ -21,7 +21,7 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.clip import exr
 from qsim.clip.clip import Clip
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.manifest import RELATIVE, check_outside
 from qsim.clip.stream import Stream, write_packed
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
@@ -105,6 +105,7 @@ def to_clip(
     if capture.sensor is not None or capture.ppp is not None:
         name = "sensor" if capture.sensor is not None else "ppp"
         raise ValueError(f"{path}: {recording.source} holds light, which no sensor made; leave --{name} out")
+    check_outside(path)
     frames, height, width = recording.shape
     meta: dict[str, Any] = {
         "shape": [frames, height, width],
@@ -170,6 +171,7 @@ def to_stream(
         raise ValueError(f"{path}: --split is stored in clips, and {recording.source} becomes a stream; leave it out")
     if capture.ppp is not None and capture.sensor is None:
         raise ValueError(f"{path}: --ppp sets the gain of a named sensor; name it with --sensor, or leave --ppp out")
+    check_outside(path)
     stem = path.with_suffix("") if path.suffix in (".npy", ".json") else path
     npy, description = (stem.with_name(f"{stem.name}{end}") for end in (".npy", ".json"))  # a stem may hold dots
     for file in (npy, description):

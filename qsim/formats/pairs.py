@@ -4,7 +4,8 @@
         codes   uint8 or, above 8 bits, uint16 [N, T, H, W]
         truth   float32 [N, T, H, W], sharp expected photons per pixel and code
         flow    float32 [N, T, 2, H, W], px from a code to the next (u right, v down); NaN where it is not known
-        first, bits, ppp, clip, stream, sensor   [N]: frame of the stream, its bits and light, names, sensor as JSON
+        first, bits, ppp, exposure, frame_rate   [N]: frame of the stream, its bits, light, seconds and rate of a code
+        clip, stream, sensor, code_model         [N]: names, sensor as JSON, how a code is made of its planes
 
 A window is T successive codes of a stream; windows do not overlap. One chunk holds one window.
 """
@@ -21,6 +22,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip import Clip
+from qsim.clip.manifest import check_outside
 from qsim.clip.stream import Stream
 from qsim.files import VERSION, Progress, replacing
 
@@ -60,8 +62,10 @@ class Window:
         ppp = meta.get("ppp")
         sensor = json.dumps(meta["sensor"] | ({"defects": meta["defects"]} if "defects" in meta else {}))
         light = {"bits": self.stream.bits, "ppp": np.nan if ppp is None else float(ppp)}
+        rates = {"exposure": self.stream.exposure, "frame_rate": float(meta["frame_rate"])}
         names = {"clip": self.clip.name, "stream": self.stream.name, "sensor": sensor}
-        return {"first": self.first} | light | names
+        names |= {"code_model": str(meta.get("code_model", ""))}
+        return {"first": self.first} | light | rates | names
 
 
 def windows(splits: Mapping[str, Sequence[Clip]], frames: int) -> dict[str, list[Window]]:
@@ -150,6 +154,7 @@ def _check_target(path: Path, force: bool) -> None:
 
     if path.suffix != ".h5":
         raise ValueError(f"{path}: pairs are written to one HDF5 file; name it .h5")
+    check_outside(path)
     if not (path.exists() or path.is_symlink()):
         return
     if not force:

@@ -3,7 +3,7 @@
     NAME.npz   times  float64 [N], s from the start of the first exposure, rising within each pixel
                kind   uint8 [N], sum of 1 (the pixel counted it) and 2 (a released carrier, that is an afterpulse)
                first  int64 [H W + 1]: pixel (y, x) has the events first[y W + x] ... first[y W + x + 1] - 1
-               meta   uint8, a JSON text: format, shape [T, H, W], exposure, frame_rate, sensor
+               meta   uint8, a JSON text: format, shape [T, H, W], exposure, frame_rate, sensor; rows, if delayed
 
 Frame t is exposed from t / frame_rate on, by each row's clock if rows have delays. Times are not rounded, so dead times
 hold exactly. Events of kind 0 came while the pixel was dead: with them the file holds the photons that other pixels
@@ -23,6 +23,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import check_shape
+from qsim.clip.rows import Rows, from_dict
 from qsim.clip.simulation import stored
 from qsim.clip.stream import Stream
 from qsim.files import decoding_errors
@@ -44,6 +45,7 @@ class PhotonTimes:
     times: Array  # [N]
     kind: Array  # [N]
     first: Array  # [H W + 1]
+    rows: Rows | None = None  # rows or columns at their own time
 
     def detections(self, y: int, x: int) -> Array:
         """Return the times [s] of what pixel (y, x) counted, float64 [n]."""
@@ -121,7 +123,7 @@ def write(stream: Stream, path: Path) -> int:
     if not np.array_equal(np.minimum(found.counts(), stream.sensor.levels - 1), stream.codes()):
         raise ValueError(f"{stream.path}: its codes are not the counts of its photons; sense it again with --force")
     meta = {"format": FORMAT, "shape": [frames, height, width], "exposure": stream.exposure, "frame_rate": rate}
-    text = files.to_json(meta | {"sensor": stream.meta["sensor"]})
+    text = files.to_json(meta | {key: stream.meta[key] for key in ("sensor", "rows") if key in stream.meta})
     with files.replacing(path) as file:
         np.savez(file, times=times, kind=kind, first=first, meta=np.frombuffer(text, np.uint8))
     return len(times)
@@ -140,7 +142,9 @@ def read(path: Path) -> PhotonTimes:
         exposure, rate = meta["exposure"], meta["frame_rate"]
         if not (is_positive(exposure) and is_positive(rate) and exposure * rate < 1 + 1e-9):
             raise ValueError(f"{path}: an exposure of {exposure!r:.40} s at {rate!r:.40} frames per second")
-        photons = PhotonTimes(shape, float(exposure), float(rate), found["times"], found["kind"], found["first"])
+        rows = from_dict(meta["rows"], f"{path}: rows") if "rows" in meta else None
+        events = (found["times"], found["kind"], found["first"])
+        photons = PhotonTimes(shape, float(exposure), float(rate), *events, rows=rows)
         _check(path, photons)
     return photons
 
@@ -154,7 +158,9 @@ def read_photons(path: Path, hints: Hints) -> Recording:
     fired = photons.clocked(planes).reshape(-1, planes, *photons.shape[1:])
     codes = fired.sum(axis=1, dtype=np.uint8)
     rate, exposure = photons.frame_rate, photons.exposure
-    return Recording(photons.shape, lambda a, b: codes[a:b], "photon times", bits, frame_rate=rate, exposure=exposure)
+    meta = {} if photons.rows is None else {"rows": photons.rows.to_dict()}
+    shape, name = photons.shape, "photon times"
+    return Recording(shape, lambda a, b: codes[a:b], name, bits, meta=meta, frame_rate=rate, exposure=exposure)
 
 
 def _arrays(path: Path) -> dict[str, Array]:

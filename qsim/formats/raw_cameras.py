@@ -121,7 +121,8 @@ def raw_files(path: Path) -> list[Path]:
     found = list(path.rglob("*.bin"))
     if not found:
         raise FileNotFoundError(f"{path}: no such file, or a folder without .bin files")
-    return sorted(found, key=lambda file: [int(n) for n in re.findall(r"\d+", str(file.relative_to(path)))])
+    numbers = {file: [int(n) for n in re.findall(r"\d+", str(file.relative_to(path)))] for file in found}
+    return sorted(found, key=lambda file: (numbers[file], str(file)))
 
 
 def _raw(

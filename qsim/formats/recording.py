@@ -71,16 +71,23 @@ def check_size(path: Path, size: int, frame_bytes: int, what: str, footer: tuple
 
 
 def numbered(paths: list[Path]) -> list[Path]:
-    """Return files in the order of the last number in their names; a text sort puts 10 before 2.
+    """Return files in the order of the numbers in their names; a text sort puts 10 before 2.
 
-    Hidden files are left out: some systems put one beside each file.
+    All numbers count, as in 0.999 before 1.000, but the last one alone where it is a counter: each file has its own,
+    and either none is left out or the names differ in more than numbers (3fa_1, 0c7_2). Hidden files are left out:
+    some systems put one beside each file.
     """
+    shown = [path for path in paths if not path.name.startswith(".")]
+    last = {path: int((re.findall(r"\d+", path.stem) or ["-1"])[-1]) for path in shown}
+    texts, values = {re.sub(r"\d+", "0", path.stem) for path in shown}, set(last.values())
+    whole = max(values, default=0) - min(values, default=0) < len(shown)
+    counter = len(values) == len(shown) and (whole or len(texts) > 1)
 
-    def key(path: Path) -> tuple[str, int, str]:
-        numbers = re.findall(r"\d+", path.stem)
-        return str(path.parent), int(numbers[-1]) if numbers else -1, path.name
+    def key(path: Path) -> tuple[str, list[Any], str]:
+        parts = [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", path.stem))]
+        return str(path.parent), [last[path]] if counter else parts, path.name
 
-    return sorted((path for path in paths if not path.name.startswith(".")), key=key)
+    return sorted(shown, key=key)
 
 
 def light_recording(

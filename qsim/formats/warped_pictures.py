@@ -8,7 +8,8 @@ They cost a thousandth of a rendered clip, and have no shading and no blur. Pict
 and are shrunk to half of their size at least, which removes most of their noise. Every clip draws its largest motion
 from 0 to `motion` px/frame; its layers translate, sway, rotate and zoom up to that. A pixel is the mean of 3 x 3
 bilinear samples; flow follows from the motion in closed form. Clip n is a function of the pictures, `seed` and n. An
-existing clip is kept, so the same command resumes. The folder holds one clip folder per number, and the licences.
+existing clip is kept, so the same command resumes; one of other settings is refused. The folder holds one clip folder
+per number, and the licences.
 """
 
 from __future__ import annotations
@@ -218,35 +219,47 @@ def write_clip(path: Path, parts: Sequence[Layer], size: tuple[int, int], meta: 
 
 
 def make(folder: Path, pictures: Path, licence: Path, args: argparse.Namespace) -> int:
-    """Write the missing clips below `folder`, and return their number."""
+    """Write the missing clips below `folder`, and return their number; `ValueError` for a clip of other settings."""
     size = (args.height, args.width)
     paths = pictures_in(pictures)
     lights = read_pictures(paths, max(size))
     if not licence.is_file():
         raise FileNotFoundError(f"{licence}: no such file; name the file that states the licence of the pictures")
+    digests = [f"texture {files.sha256(path)}" for path in paths]
+    numbers = range(args.first, args.first + args.clips)
+    wanted = {folder / f"warped_{n:05d}": _described(n, digests, args) for n in numbers}
+    missing = {path: meta for path, meta in wanted.items() if not path.exists()}
+    for path, meta in wanted.items():
+        if path not in missing:
+            _check_same(path, meta)
     folder.mkdir(parents=True, exist_ok=True)
     _copy_licence(licence, folder)
-    digests = [f"texture {files.sha256(path)}" for path in paths]
-    made = 0
-    for n in range(args.first, args.first + args.clips):
-        path = folder / f"warped_{n:05d}"
-        if path.exists():
-            Clip.open(path)  # raises: another thing of this name
-            continue
-        rng = np.random.default_rng([args.seed, n])
-        meta = {
-            "shape": [args.frames, *size],
-            "frame_rate": 2000.0,
-            "exposure": 1 / 2000.0,
-            "radiance_unit": RELATIVE,
-            "camera": None,
-            "split": args.split,
-            "assets": digests,
-            "source": {"format": "warped pictures", "seed": args.seed, "number": n, "motion": args.motion},
-        }
+    for path, meta in missing.items():
+        rng = np.random.default_rng([args.seed, meta["source"]["number"]])
         write_clip(path, layers(lights, size, args.motion, rng), size, meta)
-        made += 1
-    return made
+    return len(missing)
+
+
+def _described(n: int, digests: list[str], args: argparse.Namespace) -> dict[str, Any]:
+    """Return clip.json of clip n, without what its writer measures."""
+    return {
+        "shape": [args.frames, args.height, args.width],
+        "frame_rate": 2000.0,
+        "exposure": 1 / 2000.0,
+        "radiance_unit": RELATIVE,
+        "camera": None,
+        "split": args.split,
+        "assets": digests,
+        "source": {"format": "warped pictures", "seed": args.seed, "number": n, "motion": args.motion},
+    }
+
+
+def _check_same(path: Path, meta: dict[str, Any]) -> None:
+    """Raise `ValueError` if a clip has another size, other pictures, another seed or motion; its split may differ."""
+    there = Clip.open(path).meta
+    for key, what in (("shape", "size"), ("assets", "set of pictures"), ("source", "seed or motion")):
+        if there.get(key) != meta[key]:
+            raise ValueError(f"{path}: was made with another {what}; name another folder, or another --first")
 
 
 def _copy_licence(licence: Path, folder: Path) -> None:

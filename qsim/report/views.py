@@ -93,8 +93,10 @@ def _clip_source(clip: Clip, chosen: str | None) -> Source:
     if chosen is not None or clip.streams:
         length, held = _held_views(clip, clip.stream(chosen or clip.streams[0]))
         views |= held
-    if clip.has_truth:
-        views |= {"flow": _flow_view(clip), "depth": _depth_view(clip)}
+    if clip.holds("u"):
+        views["flow"] = _flow_view(clip)
+    if clip.holds("Z"):  # clips of warped pictures have none
+        views["depth"] = _depth_view(clip)
     return Source(clip.name, length, clip.frame_rate, views)
 
 

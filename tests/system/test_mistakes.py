@@ -183,6 +183,15 @@ MISTAKES = [
     ("qsim tradeoff fan -o lit", "lit: is a clip, which holds nothing else; name another folder"),
     ("qsim convert data lit --to mp4", "lit: is a clip, which holds nothing else; name another folder"),
     ("qsim convert pictures lit --frame-rate 9 --transfer srgb", "lit: is a clip, which holds nothing else"),
+    (
+        "qsim convert data/clips/fan_0000/streams/quiver-physical_1bit_3.25ppp.json data/clips/fan_0000/streams/x.npy",
+        "fan_0000, which holds nothing else; name another place",
+    ),
+    ("qsim preview lit -o lit/streams/x.png", "lit, which holds nothing else; name another place"),
+    (
+        "qsim convert both x --frame-rate 9 --transfer srgb",
+        "both: holds videos (both/a.mp4) and other recordings (both/0.png); choose with --layout",
+    ),
     ("quiver bench -o lit", "lit: is a clip, which holds nothing else; name another folder"),
     ("quiver bench -o data", "data: is a data set, which holds nothing else; name another folder"),
     ("quiver ablate data -o lit", "lit: is a clip, which holds nothing else; name another folder"),
@@ -323,6 +332,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("first", "second"):
         (top / "pictures" / name).mkdir(parents=True)
         shutil.copy(top / "grey.png", top / "pictures" / name / "0.png")
+    (top / "both").mkdir()
+    shutil.copy(top / "grey.png", top / "both" / "0.png")
+    (top / "both" / "a.mp4").touch()
     sensor = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 1.6\nread_noise = 0.2\nbits = 3\n'
     texts = {
         "text.txt": "words\n",

@@ -10,10 +10,11 @@ import numpy as np
 
 from qsim import keys
 from qsim.clip.clip import Clip
+from qsim.clip.manifest import target_of
 from qsim.clip.photons import light_level
 from qsim.clip.sensing import Sensing, describe, sense, write_stream
 from qsim.clip.simulation import Draw
-from qsim.clip.writer import ClipWriter, target_of
+from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
 from qsim.sensor.defects import defect_table
 from qsim.sensor.spad import BinarySPAD

@@ -10,6 +10,8 @@ from clips import write_clip
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
 from qsim.clip.sensing import Sensing, sense
+from qsim.clip.stream import write_packed
+from qsim.sensor import packing
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import FixedPattern
@@ -105,6 +107,18 @@ def test_a_stream_without_its_clip_has_no_truth(tmp_path: Path):
         file.rename(moved / file.name)
     with pytest.raises(FileNotFoundError, match="does not lie in the folder of a clip"):
         type(stream).open(moved / f"{stream.name}.json").truth()
+
+
+def test_an_imported_stream_has_no_truth(tmp_path: Path):
+    """It ended in a TypeError: a stream without a clip is not found, one in a clip has no light level."""
+    clip = write_clip(tmp_path / "c", frames=2, height=5, width=6)
+    (clip.path / "streams").mkdir()
+    packed = packing.pack(np.ones((2, 5, 6), np.uint8), SENSOR.bits)
+    meta = {"shape": [2, 5, 6], "ppp_factor": None, "exposure": 5e-4, "frame_rate": 2000.0}
+    with pytest.raises(FileNotFoundError, match="does not lie in the folder of a clip"):
+        write_packed(tmp_path / "capture.npy", [packed], SENSOR, meta).truth()
+    with pytest.raises(ValueError, match=r"capture\.npy: was imported, so its light is not known"):
+        write_packed(clip.path / "streams" / "capture.npy", [packed], SENSOR, meta).truth()
 
 
 def test_known_pixels_are_those_that_did_not_saturate(tmp_path: Path):

@@ -146,6 +146,27 @@ def test_nothing_is_overwritten_without_force(tmp_path: Path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a"]
 
 
+@pytest.mark.parametrize("force", [False, True])
+def test_what_appears_at_the_place_of_a_clip_meanwhile_is_not_deleted(tmp_path: Path, force: bool):
+    """It is refused when the clip is complete; moved away, the same command only renames."""
+    path = tmp_path / "a"
+    if force:
+        write(path)
+    writer = ClipWriter(path, meta(), force=force).__enter__()
+    for t in range(FRAMES):
+        writer.add(t, radiance(t))
+    path.mkdir(exist_ok=True)
+    (path / "notes.txt").write_text("mine")
+    told = r"notes\.txt: was not made by" if force else r"a: appeared while .* is complete in a\.part; move it away"
+    with pytest.raises(FileExistsError, match=told):
+        writer.__exit__(None, None, None)
+    assert (path / "notes.txt").read_text() == "mine"
+    path.rename(tmp_path / "mine")
+    with ClipWriter(path, meta(), force=force) as again:
+        assert all(again.has(t) for t in range(FRAMES))
+    assert Clip.open(path).verify() == []
+
+
 def test_files_and_other_folders_are_never_replaced(tmp_path: Path):
     """Neither a folder, nor a file, nor a folder of another origin with the name of the temporary one."""
     (tmp_path / "thesis").mkdir()

@@ -1,6 +1,7 @@
 """`qsim check --redraw`: correct streams of every kind pass; wrong codes are found even if all checksums fit."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.rows import Rows
 from qsim.clip.sensing import Sensing, prepare, replay, sense, write_stream
 from qsim.clip.simulation import stored
-from qsim.clip.stream import Stream
+from qsim.clip.stream import Stream, write_packed
 from qsim.dataset import redraw
 from qsim.dataset.generation import Options, generate
 from qsim.dataset.job import Job, Settings
@@ -192,6 +193,25 @@ def test_streams_of_other_origin_and_damaged_ones_are_said_not_passed(clip, tmp_
     empty = write_clip(tmp_path / "empty", frames=3, height=8, width=9)
     assert program.main(["check", str(empty.path), "--redraw"]) == 2
     assert "empty: holds no stream to draw again" in capsys.readouterr().err
+
+
+def test_streams_beside_no_clip_and_restored_video_do_not_end_the_check(clip, tmp_path, capsys):
+    """What was redrawn before them was lost."""
+    stream = drawn(clip, tmp_path, "QIS")
+    capture, moved, video = (tmp_path / "out" / f"{name}.npy" for name in ("capture", "moved", "video"))
+    capture.parent.mkdir()
+    meta = {"shape": list(stream.shape), "ppp_factor": None, "exposure": 5e-4, "frame_rate": 2000.0}
+    write_packed(capture, [stream.packed], stream.sensor, meta)
+    for end in (".npy", ".json"):
+        shutil.copy(stream.path.with_suffix(end), moved.with_suffix(end))
+    np.save(video, np.ones(stream.shape, np.float32))
+    described = {"method": "moment", "seconds_per_frame": 0.1, "sha256": files.sha256(video)}
+    files.write_description(video.with_suffix(".json"), described)
+    assert program.main(["check", *map(str, (stream.path, capture, moved, video)), "--redraw"]) == 0
+    out = capsys.readouterr().out
+    assert f"{capture}: not drawn again: its description holds no seed" in out
+    assert f"{moved}: not drawn again: {tmp_path}: not a clip folder" in out
+    assert "drawn again: 1 of 3 streams" in out
 
 
 def test_a_few_codes_in_a_million_are_the_compiled_engines_own():

@@ -77,6 +77,23 @@ def test_repair_names_the_streams_that_go_with_a_clip(tmp_path: Path):
         assert problems_of(folder) == []
 
 
+def test_repair_leaves_a_clip_with_files_of_yours(tmp_path: Path):
+    """It deleted them; it is refused before anything is deleted."""
+    folder, again = tmp_path / "d", Options(workers=0, repair=True)
+    generate(SMALL, folder, HERE, make=make)
+    note = folder / "clips" / "tumble_0004" / "notes.txt"
+    note.write_text("mine")
+    for name in ("fan_0000", "tumble_0004"):
+        damage(folder / "clips" / name / "radiance" / "000000.exr", "bit-flipped")
+    with pytest.raises(FileExistsError, match=r"notes\.txt: was not made by this program, which replaces only what it"):
+        generate(SMALL, folder, again, make=make)
+    assert note.read_text() == "mine"
+    assert len(list(folder.glob("jobs/*.json"))) == 3
+    note.unlink()
+    assert generate(SMALL, folder, again, make=make).made == 2
+    assert problems_of(folder) == []
+
+
 def test_repair_does_not_take_the_clips_of_another_recipe(tmp_path: Path):
     folder = tmp_path / "d"
     generate(SMALL, folder, HERE, make=make)

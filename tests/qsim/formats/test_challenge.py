@@ -13,6 +13,7 @@ from hostile import VALUES, one_line
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from recordings import everything
 from stats import assert_share
 
 from qsim.cli.program import main
@@ -54,6 +55,17 @@ def test_cubes_are_read_as_the_benchmark_says(tmp_path_factory, frames: int, hei
     meta = json.loads((folder / "out" / "meta.json").read_text())
     assert (meta["cubes"], meta["left_out"], meta["width"]) == (len(found), frames % planes, width)
     assert (meta["transfer"], meta["benchmark"]) == ("srgb", False)
+
+
+def test_an_exported_cube_is_imported_with_its_width(tmp_path):
+    """Up to seven dark columns came with it; the description of another program does not count."""
+    clip = three_bands(tmp_path / "fan", frames=4, width=10)
+    exporting.export(clip, tmp_path / "out", Export("challenge", planes=4))
+    cube = tmp_path / "out" / "000000.npy"
+    for channel, name in enumerate(challenge.COLOURS):
+        np.testing.assert_array_equal(everything(cube, channel=channel), clip.stream(name).codes())
+    (tmp_path / "out" / "meta.json").write_text('{"shape": [4, 5, 10], "width": 10}')
+    assert everything(cube, channel=1).shape == (4, 5, 16)
 
 
 def test_golden_bytes(tmp_path):

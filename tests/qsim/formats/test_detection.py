@@ -1,5 +1,6 @@
 """Tests layouts: recognised by name, signature and size, never guessed."""
 
+import gzip
 import re
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from recordings import clip_of, everything
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
 from qsim.colour import to_linear
-from qsim.formats import detection, exporting, images, importing
+from qsim.formats import detection, exporting, images, importing, video
 from qsim.formats.exporting import Export
 
 
@@ -137,3 +138,37 @@ def test_a_tree_of_picture_folders_becomes_clips(tmp_path: Path):
     np.testing.assert_allclose(clip.radiance(2), to_linear(pictures[2], "srgb", 255), rtol=2**-10)
     assert main(["convert", str(tmp_path / "in" / "Type2" / "v1.0"), str(tmp_path / "one"), *options]) == 0
     assert Clip.open(tmp_path / "one").shape == (3, 9, 7)
+
+
+def test_a_video_among_pictures_is_not_preferred(tmp_path: Path, capsys):
+    """The preview of a recording became the clip, and its pictures were dropped."""
+    pytest.importorskip("av")
+    pictures = np.random.default_rng(0).integers(0, 255, (3, 8, 10)).astype(np.uint8)
+    (tmp_path / "in").mkdir()
+    images.write_png(tmp_path / "in", iter(pictures))
+    video.write_video(tmp_path / "in" / "preview.mp4", iter(pictures), 30, lossless=True)
+    command = ["convert", str(tmp_path / "in"), str(tmp_path / "out"), "--frame-rate", "1000", "--transfer", "srgb"]
+    assert main(command) == 2
+    both = f"holds videos ({tmp_path / 'in' / 'preview.mp4'}) and other recordings ({tmp_path / 'in' / '000000.png'})"
+    assert f"{both}; choose with --layout" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert main([*command, "--layout", "png"]) == 0
+    assert Clip.open(tmp_path / "out").shape == (3, 8, 10)
+    command[2] = str(tmp_path / "videos")
+    assert main([*command, "--layout", "video"]) == 0
+    assert [path.name for path in (tmp_path / "videos").iterdir()] == ["preview"]
+
+
+def test_a_gzipped_array_is_asked_about_like_another(tmp_path: Path):
+    """Its codes became a stream eight times as wide, made of their bits."""
+    codes = np.random.default_rng(0).integers(0, 8, (3, 5, 7)).astype(np.uint8)
+    packed = tmp_path / "a.npy.gz"
+    for array in (codes, codes > 3):
+        np.save(tmp_path / "a.npy", array)
+        packed.write_bytes(gzip.compress((tmp_path / "a.npy").read_bytes()))
+        if array.dtype == bool:
+            np.testing.assert_array_equal(everything(packed), array)
+            continue
+        with pytest.raises(ValueError, match=r"a\.npy\.gz: uint8 up to 7: codes of 3 bits.* --layout codes"):
+            importing.read(packed)
+        np.testing.assert_array_equal(everything(packed, bits=3), codes)

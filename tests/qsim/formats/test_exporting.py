@@ -23,6 +23,9 @@ from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
 from qsim.scene import Spin, Translation, describe
 from qsim.scene.camera_path import read_camera_path
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.fixed_pattern import FixedPattern
+from qsim.sensor.spad import BinarySPAD
 
 
 @pytest.mark.parametrize("bits", range(1, 9))
@@ -193,3 +196,52 @@ def test_clips_without_poses_have_no_camera_path(tmp_path: Path, capsys: pytest.
     assert main(["convert", str(stream.path), str(tmp_path / "out"), "--to", "nerfstudio"]) == 2
     assert "is a stream, and poses belong to light" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_an_export_states_what_decides_its_codes(tmp_path: Path):
+    """Defects, place in the frame and light level were left out: hot pixels had no reason."""
+    camera = describe(Camera(8e-3, 2.8, 1.1e-6, 11, 15))
+    clip = write_clip(tmp_path / "clip", frames=2, height=7, width=10, camera=camera, origin=[3, 4])
+    stream = clip.sense(BinarySPAD(0.4, 20.0), lux=50.0, defects=Defects(FixedPattern(dead=0.1)))
+    exporting.export(stream, tmp_path / "a.npy", Export("cube"))
+    meta = json.loads((tmp_path / "a.npy.json").read_text())
+    keys = ("defects", "origin", "ppp", "lux_target", "diffraction")
+    assert {key: meta[key] for key in keys} == {key: stream.meta[key] for key in keys}
+    assert (meta["origin"], meta["lux_target"]) == ([3, 4], 50.0)
+
+
+def test_an_export_does_not_replace_what_appeared_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    clip, target, real = write_clip(tmp_path / "clip", frames=2), tmp_path / "out", exporting.EXPORTS["png"]
+
+    def slow(*words: object) -> None:
+        real(*words)
+        target.mkdir()
+        (target / "notes.txt").write_text("mine")
+
+    monkeypatch.setitem(exporting.EXPORTS, "png", slow)
+    for force, told in ((False, "out: appeared while it was written; move it away"), (True, "out: was not written by")):
+        with pytest.raises(FileExistsError, match=told):
+            exporting.export(clip, target, Export("png"), force=force)
+        assert (target / "notes.txt").read_text() == "mine"
+        shutil.rmtree(target)
+
+
+def test_nothing_is_written_into_a_clip(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """The description of an export in `streams` counted as a stream without codes."""
+    clip = write_clip(tmp_path / "clip", frames=2, height=6, width=8)
+    stream, inside = clip.sense(BinarySPAD(0.4, 20.0), ppp=1.0), clip.path / "streams"
+    np.save(tmp_path / "planes.npy", stream.codes() > 0)
+    np.save(tmp_path / "light.npy", np.ones((2, 6, 8), np.float32))
+    for words in (
+        ["convert", stream.path, inside / "cube.npy"],
+        ["convert", clip.path, clip.path / "film.mp4"],
+        ["convert", clip.path, inside / "pairs.h5", "--window", 2],
+        ["convert", tmp_path / "planes.npy", inside / "capture", "--frame-rate", 9],
+        ["convert", tmp_path / "light.npy", clip.path / "light", "--frame-rate", 9],
+        ["preview", clip.path, "-o", inside / "a.png"],
+    ):
+        assert main([str(word) for word in words]) == 2
+        told = capsys.readouterr().err
+        assert f": lies in the clip {clip.path}, which holds nothing else; name another place" in told
+    assert clip.streams == (stream.name,)
+    assert main(["check", str(clip.path)]) == 0

@@ -128,3 +128,18 @@ def test_one_bit_tiff_of_both_polarities(tmp_path: Path):
         path = tmp_path / f"{photometric}.tif"
         tifffile.imwrite(path, stored, photometric=photometric)
         np.testing.assert_array_equal(everything(path)[0], bits)
+
+
+def test_tiff_of_other_colours_is_not_read_as_grey_or_rgb(tmp_path: Path):
+    """Indices of a palette were light, cyan was red; --bits says that the indices are codes."""
+    import tifffile
+
+    path, pixels = tmp_path / "a.tif", np.random.default_rng(0).integers(0, 256, (9, 7, 4)).astype(np.uint8)
+    table = np.random.default_rng(1).integers(0, 65536, (3, 256)).astype(np.uint16)
+    tifffile.imwrite(path, pixels, photometric="separated")
+    with pytest.raises(ValueError, match=r"a\.tif: page 0 holds SEPARATED pixels; save it as grey or RGB"):
+        everything(path, transfer="srgb")
+    tifffile.imwrite(path, pixels[..., 0], photometric="palette", colormap=table)
+    with pytest.raises(ValueError, match=r"a\.tif: page 0 holds PALETTE pixels; save it as grey or RGB"):
+        everything(path, transfer="srgb")
+    np.testing.assert_array_equal(everything(path, bits=8)[0], pixels[..., 0])

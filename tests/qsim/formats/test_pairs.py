@@ -39,6 +39,8 @@ def test_a_data_set_becomes_windows_by_split(tmp_path: Path, capsys: pytest.Capt
                 np.testing.assert_allclose(group["truth"][n], stream.truth(first, first + 5), rtol=1e-6)
                 assert (group["bits"][n], group["ppp"][n]) == (stream.bits, pytest.approx(stream.meta["ppp"]))
                 assert json.loads(group["sensor"].asstr()[n]) == stream.meta["sensor"]
+                rates = (group["exposure"][n], group["frame_rate"][n], group["code_model"].asstr()[n])
+                assert rates == (stream.exposure, 2000.0, stream.sensor.code_model)
                 seen.add((clip.name, stream.name, int(first)))
     assert len(seen) == 12
 

@@ -16,6 +16,7 @@ from stats import assert_histogram, assert_share
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
+from qsim.clip.rows import Rows
 from qsim.clip.stream import Stream
 from qsim.formats import importing, photon_times
 from qsim.formats.recording import Hints
@@ -145,6 +146,17 @@ def test_rates_in_the_file_are_used_and_none_may_contradict(tmp_path, capsys):
         assert said in capsys.readouterr().err
 
 
+def test_rows_at_their_own_time_are_stated(tmp_path):
+    """In the file, and in the description of the codes that are read from it."""
+    rows = Rows(5e-5, "up")
+    photon_times.write(
+        followed(moving(tmp_path / "c"), CountingSPAD(0.5, 10.0, 1e-6, 4), 5.0, rows=rows), tmp_path / "p.npz"
+    )
+    assert photon_times.read(tmp_path / "p.npz").rows == rows
+    assert main(["convert", str(tmp_path / "p.npz"), str(tmp_path / "clocked")]) == 0
+    assert Stream.open(tmp_path / "clocked.json").meta["source"]["rows"] == {"delay": 5e-5, "order": "up"}
+
+
 def test_damaged_files_are_refused_in_one_line(tmp_path):
     clip = moving(tmp_path / "c")
     photon_times.write(followed(clip, CountingSPAD(0.5, 10.0, 1e-6, 4), 5.0), tmp_path / "p.npz")
@@ -171,7 +183,7 @@ def test_damaged_files_are_refused_in_one_line(tmp_path):
     assert wrong > 150
     arrays = dict(np.load(tmp_path / "p.npz"))
     meta = json.loads(arrays["meta"].tobytes())
-    for key in ("format", "shape", "exposure", "frame_rate"):
+    for key in ("format", "shape", "exposure", "frame_rate", "rows"):
         for value in VALUES:
             right = not isinstance(value, bool) and isinstance(value, int | float) and 1e-30 <= value <= 1e30
             if key in ("exposure", "frame_rate") and right:  # another clock, of which a file can be

@@ -121,6 +121,13 @@ def test_the_bit_order_of_raw_files_is_said_as_it_is_read(tmp_path: Path, layout
     np.testing.assert_array_equal(importing.read(tmp_path / "a.raw", hints).read(0, 1), one((1, *size), (0, row, 0)))
 
 
+def test_files_of_equal_numbers_have_one_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It was the order of the file system."""
+    found = [tmp_path / folder / "acq_0.bin" for folder in "ba"]
+    monkeypatch.setattr(Path, "rglob", lambda self, pattern: iter(found))
+    assert raw_cameras.raw_files(tmp_path) == found[::-1]
+
+
 @pytest.mark.parametrize("full", [False, True])
 def test_our_camera_files_are_read_alike_by_others(tmp_path: Path, full: bool):
     photoncube = pytest.importorskip("photoncube", reason="the package photoncube is not installed")

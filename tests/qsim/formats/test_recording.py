@@ -33,6 +33,25 @@ def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):
     ]
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"img_{n}_200us" for n in range(1, 13)],
+        [f"{ms // 1000}.{ms % 1000:03}" for ms in range(995, 1006)],
+        ["12-30-58", "12-30-59", "12-31-00", "12-31-01"],
+        [f"take{take}_{n}" for take in (1, 2) for n in range(9, 12)],
+        # right before, too: a constant number, a hash (one frame left out) or an exposure before the counter
+        [f"cam2_{n}" for n in range(8, 12)],
+        ["3fa9c1_1", "77bc_2", "0c7d1_4", "e5_11"],
+        [f"img_{400 if n % 2 else 100}us_{n}" for n in range(1, 13)],
+    ],
+    ids=lambda names: names[0],
+)
+def test_the_numbers_of_a_name_decide_its_place(names: list[str]):
+    shuffled = np.random.default_rng(0).permutation(names)
+    assert [path.stem for path in numbered([Path(f"{name}.png") for name in shuffled])] == names
+
+
 def test_flips(tmp_path: Path):
     expected = random_planes(2, 512, 512)
     (tmp_path / "acq_0.bin").write_bytes(raw_planes.spad512s(expected))

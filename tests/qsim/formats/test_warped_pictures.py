@@ -88,6 +88,28 @@ def test_a_repeat_gives_the_same_bytes_and_keeps_what_is_there(pictures, tmp_pat
     assert len(open_clips(tmp_path / "again")) == 3
 
 
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--seed", 1], "seed or motion"),
+        (["--motion", 4], "seed or motion"),
+        (["--frames", 6], "size"),
+        ([], "set of pictures"),
+    ],
+)
+def test_clips_of_other_settings_are_not_taken_for_these(pictures, tmp_path, capsys, words, named):
+    """They were kept and counted, and the folder got two kinds of clips."""
+    assert run(pictures, tmp_path / "out", "--clips", 1) == 0
+    if not words:
+        (pictures / "b.jpg").rename(pictures.parent / "b.jpg")
+    capsys.readouterr()
+    assert run(pictures, tmp_path / "out", "--clips", 2, *words) == 2
+    said = capsys.readouterr().err
+    assert f"{tmp_path / 'out' / 'warped_00000'}: was made with another {named}; name another folder" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out" / "warped_00001").exists()
+
+
 def test_a_second_licence_leaves_the_first_one(pictures, tmp_path):
     """Pictures of two licences in one folder, as docs/datasets.md shows: a repeat adds no third file."""
     texts = ["CC0", "CC BY 4.0", "CC0", "CC BY 4.0"]

@@ -3,9 +3,10 @@
 import json
 
 import numpy as np
-from clips import write_clip
+from clips import square_clip, write_clip
 
 from qsim import colour as pictures
+from qsim.cli.program import main
 from qsim.clip.photons import clip_photons
 from qsim.clip.rows import Rows
 from qsim.clip.stream import Stream, write_packed
@@ -52,6 +53,13 @@ def test_packed_planes_are_unpacked(tmp_path):
 def test_a_clip_without_streams_shows_its_light(tmp_path):
     clip = write_clip(tmp_path / "plain", frames=3)
     assert list(open_source(clip.path).views) == ["sharp"]
+
+
+def test_a_clip_with_flow_alone_shows_it(tmp_path):
+    """As clips of warped pictures: every preview of them ended with "has no channel 'Z' (depth)"."""
+    clip = square_clip(tmp_path / "flow")
+    assert list(open_source(clip.path).views) == ["sharp", "flow"]
+    assert main(["preview", str(clip.path), "-o", str(tmp_path / "a.png")]) == 0
 
 
 def slow_codes(source: Source, stream: Stream) -> list[int]:
