@@ -4,10 +4,10 @@
     python docs/bench_rows.py --rows mergenet,qbp-bm3d    # these alone
     python docs/bench_rows.py --tiny --out out/bench_rows # frames of 32 x 32 px on any cores: tries this program
 
-A row is RESULTS/NAME.json, made once by `quiver bench` with two threads. Frames have 512 x 1024 px; networks of a
-million multiply-adds per pixel and frame stand beside smaller ones of published width. The row `modes` compares the
-three modes of QUIVER and half precision on small frames. Busy cores are refused (rows.py); --busy makes rows there,
-which are marked.
+A row is RESULTS/NAME.json, made once by `quiver bench` with two threads and no GPU. Frames have 512 x 1024 px; networks
+of a million multiply-adds per pixel and frame stand beside smaller ones of published width. The row `modes` compares
+the three modes of QUIVER and half precision on small frames. Busy cores are refused (rows.py); --busy makes rows
+there, which are marked.
 """
 
 from __future__ import annotations
@@ -84,6 +84,9 @@ def main(words: list[str] | None = None) -> int:
         return 2
     try:
         keep_apart("bench", args.out, trial=args.tiny)
+        for path in sorted(args.out.glob("*.json")):  # they share a page
+            if path.stem in ROWS:
+                is_made(path, plan_of(path.stem, tiny=args.tiny))
         for name in names:
             make(args.out / f"{name}.json", plan_of(name, tiny=args.tiny), busy=args.busy or args.tiny)
             write_page(args.out)
@@ -105,8 +108,9 @@ def make(path: Path, plan: Plan, *, busy: bool) -> None:
     watch = Watch.now()
     given = ((f"--{name}", value) for name, value in vars(plan).items() if value is not None and name != "threads")
     with tempfile.TemporaryDirectory() as folder:
-        words = (word for pair in given for word in pair)
-        quiver("bench", *words, "-o", folder, "-q", budget=Budget(threads=plan.threads), problems=True)
+        words = [word for pair in given for word in pair]
+        place = () if plan.methods in CLASSICAL else ("--device", "cpu")  # classical methods have no other
+        quiver("bench", *words, *place, "-o", folder, "-q", budget=Budget(threads=plan.threads), problems=True)
         costs = read_json(Path(folder) / "bench.json")["costs"]
     path.parent.mkdir(parents=True, exist_ok=True)
     store(path, plan, watch, {"name": path.stem, "machine": machine(), "costs": costs})

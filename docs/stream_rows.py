@@ -24,6 +24,7 @@ from quiver.evaluation.comparison import Comparison, ComparisonRow, restore_clip
 from quiver.evaluation.json_values import json_safe
 from quiver.evaluation.summary import summarise
 from quiver.model.weights import metadata_of
+from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.restorers import restorer
 
 LIGHT = Illumination("quiver-physical", float(LIGHTS[0]), 3)
@@ -86,8 +87,9 @@ def learned(name: str, rate: str, minutes: float, clip: Clip, args: argparse.Nam
     sense(Clip.open(copy), LIGHT.sensing(0))
     frames = min(FRAMES, len(clip) // 8 * 8)
     quiver(
-        *("train", copy, "-o", folder, "--preset", name, "--minutes", minutes, "--optimiser", "adam"),
-        *("--learning-rate", rate, "--crop", budget.crop, "--batch", BATCH, "--frames", frames, "-q"),
+        *("train", copy, "-o", folder, "--preset", name, "--device", "cpu", "--minutes", minutes),
+        *("--optimiser", "adam", "--learning-rate", rate),
+        *("--crop", budget.crop, "--batch", BATCH, "--frames", frames, "-q"),
         budget=budget,
     )
     return folder
@@ -96,4 +98,5 @@ def learned(name: str, rate: str, minutes: float, clip: Clip, args: argparse.Nam
 def restored(run: Path, clip: Clip, data: Path) -> ComparisonRow:
     """Return the scores of a clip restored by the weights of a run, from the codes that the run learned from."""
     codes, factor = sensed(clip, LIGHT)
-    return restore_clip(restorer(str(run)), clip, LIGHT, Comparison(str(data), lights=(LIGHT,)), codes, factor)
+    method = restorer(str(run), RestoreOptions(device="cpu"))
+    return restore_clip(method, clip, LIGHT, Comparison(str(data), lights=(LIGHT,)), codes, factor)

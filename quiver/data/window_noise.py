@@ -53,6 +53,11 @@ def check_windows(noise: Noise, clip: Clip) -> None:
     draw = noise.draw(clip)
     if draw.remembers:
         raise ValueError(f"{noise.sensor}: training windows cannot follow the charge of a spike camera; give --sensor")
+    if draw.diffraction and clip.camera is None:
+        raise ValueError(
+            f"{clip.name}: diffraction needs a camera, and this clip's radiance is relative (imported video); leave "
+            "its data set out, or sense the other clips without --diffraction"
+        )
     if noise.defects is not None:
         array = _pixel_array(noise.defects, draw.plane, clip.shape[1:], draw.origin)
         if array.follows_photons:

@@ -104,8 +104,11 @@ class Windows(Dataset[dict[str, Any]]):
         check_clips(clips, settings)
         self.clips, self.settings, self.fixed, self.prepare = tuple(clips), settings, fixed, prepare
         self.noise = choose(clips) if settings.lights is None else Mixture(tuple(map(Noise.of, settings.lights)))
+        lit = {clip.camera is None: clip for clip in reversed(clips)}  # of clips that are alike the first
+        sized = {(clip.camera is None, clip.shape[1:], clip.origin): clip for clip in reversed(clips)}  # for defects
         for noise in self.noise.noises:
-            check_windows(noise, clips[0])
+            for clip in (lit if noise.defects is None else sized).values():
+                check_windows(noise, clip)
         self.length = len(clips) * (len(self.noise.noises) if fixed else repeats)
         self._draws: dict[tuple[int, int], tuple[Draw, Array | None, Sensor]] = {}
 

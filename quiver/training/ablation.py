@@ -6,6 +6,7 @@ for each of six combinations of pre-denoiser, flow and multi-scale outputs: trai
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,31 +51,34 @@ def run_ablation(
     options: RestoreOptions,
     *,
     should_stop: Callable[[], bool] = lambda: False,
+    while_training: AbstractContextManager[object] | None = None,
     progress: bool = True,
 ) -> tuple[list[Restorer], list[ComparisonRow]] | None:
     """Train every combination in OUT/NAME (finished ones are kept), score them in OUT/table, and return the scores.
 
-    None if `should_stop` ended it; the same call resumes it. ValueError if the preset has no ablation.
+    None if `should_stop` ended it; the same call resumes it. Only training asks it, inside `while_training`. ValueError
+    if the preset has no ablation.
     """
     out = Path(settings.out)
     out.mkdir(parents=True, exist_ok=True)
     with alone_in(out, "works"):
-        return _run_ablation(settings, comparison, options, should_stop, progress)
+        with while_training or nullcontext():
+            _train(settings, options, should_stop, progress)
+        if should_stop():
+            return None
+        methods = [restorer(str(out / name), options) for name in ABLATIONS]
+        return methods, evaluate(comparison, methods, out / "table")
 
 
-def _run_ablation(
-    settings: Settings, comparison: Comparison, options: RestoreOptions, should_stop: Callable[[], bool], progress: bool
-) -> tuple[list[Restorer], list[ComparisonRow]] | None:
-    out = Path(settings.out)
+def _train(settings: Settings, options: RestoreOptions, should_stop: Callable[[], bool], progress: bool) -> None:
+    """Train one combination after the other, until `should_stop`."""
     for name, config in networks(settings.network).items():
         torch.manual_seed(settings.seed)
         network = QUIVER(config)
-        own = replace(settings, out=str(out / name), network=f"{settings.network} {name}")
+        own = replace(settings, out=str(Path(settings.out) / name), network=f"{settings.network} {name}")
         train(network, own, device=pick_device(options.device), should_stop=should_stop, progress=progress)
         if should_stop():
-            return None
-    methods = [restorer(str(out / name), options) for name in ABLATIONS]
-    return methods, evaluate(comparison, methods, out / "table")
+            return
 
 
 def markdown(preset: str, rows: Sequence[ComparisonRow]) -> str:

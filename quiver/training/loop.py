@@ -10,6 +10,7 @@ NaN or Inf stop the run; the message names step and samples. Under `torchrun` ev
 from __future__ import annotations
 
 import contextlib
+import importlib
 import math
 import time
 import warnings
@@ -23,6 +24,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Subset, default_collate
 from tqdm import tqdm
 
+from qsim.keys import Key
 from quiver import threads
 from quiver.data.clips import clips_digest, split_clips, unfinished
 from quiver.data.stream_windows import StreamWindows
@@ -32,7 +34,7 @@ from quiver.evaluation import metrics
 from quiver.model.removed import refuse_run
 from quiver.training.optimiser import Optimiser
 from quiver.training.processes import Process, begin_worker, joined, plain_errors
-from quiver.training.run_folder import Run, recorded_condition
+from quiver.training.run_folder import Run, recorded_frames
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
 from quiver.training.self_supervised import make_stream_windows
 from quiver.training.settings import Settings, settled
@@ -120,7 +122,10 @@ def on_device(batch: Batch, device: torch.device) -> Batch:
 def validate(
     model: nn.Module, windows: Subset[dict[str, Any]], device: torch.device, system: System = OURS
 ) -> tuple[metrics.Score, Tensor]:
-    """Return the mean score, and codes, output and target of the first window side by side [h, 3w]."""
+    """Return the mean score, and codes, output and target of the first window side by side [h, 3w].
+
+    Windows without a finite PSNR, as black ones restored as black, count only where no window has one.
+    """
     model.eval()
     scores: list[metrics.Score] = []
     picture = torch.zeros(1, 1)
@@ -136,7 +141,8 @@ def validate(
         if i == 0:
             picture = torch.cat([sample["codes"][first, 0], output[0], target[0]], dim=1).clamp(0, 1)
     model.train()
-    return metrics.mean_score(scores), picture
+    finite = [score for score in scores if math.isfinite(score.psnr_matched)]
+    return metrics.mean_score(finite or scores), picture
 
 
 class Board:
@@ -178,7 +184,6 @@ class Trainer:
         self.system = system
         self.model, self.run, self.fixed, self.process = model.to(process.device).train(), run, fixed, process
         self.optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
-        self.state = run.load(model, self.optimiser)
         objective = Objective(model, system.loss, settings)
         self.parallel = (
             nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
@@ -187,13 +192,21 @@ class Trainer:
         )
         self.low = precision_of(settings, process.device) == "bfloat16"
         self.board: Board | None = None
-        self.started, self.saved = time.monotonic() - self.state.elapsed, time.monotonic()
+        self.state = State()
+        self.started = self.saved = time.monotonic()
         self.loss, self.rate = math.nan, math.nan  # of the last step
         self.validation = 0.0  # s, duration of the last one
+
+    def resume(self) -> None:
+        """Continue from the newest state in the folder, if there is one."""
+        self.state = self.run.load(self.model, self.optimiser)
+        self.started, self.saved = time.monotonic() - self.state.elapsed, time.monotonic()
 
     def step(self, batch: dict[str, Any]) -> None:
         """Update the weights by one batch; `Diverged` if its loss or gradient is not finite."""
         settings, state, device = self.run.settings, self.state, self.process.device
+        if self.process.world > 1:  # the stored random state is the leader's: every process draws from its samples
+            torch.manual_seed(Key(settings.seed, int(batch["sample"][0])).philox_key >> 1)
         self.rate = learning_rate(settings, state)
         with torch.autocast(device.type, torch.bfloat16, enabled=self.low):
             loss = self.parallel(on_device(batch, device), share_used(settings, state))
@@ -242,10 +255,11 @@ class Trainer:
         state = self.state
         entry = {"step": state.step, "elapsed": state.elapsed, "loss": self.loss, "learning_rate": self.rate}
         state.history.append(entry | score.to_dict())
-        if share_used(self.run.settings, state) >= self.system.begins(self.model):
+        finite = math.isfinite(score.psnr_matched)
+        if finite and share_used(self.run.settings, state) >= self.system.begins(self.model):
             note_plateau(self.run.settings.patience, state, score.psnr_matched)
-        if score.psnr_matched > state.best:
-            state.best = score.psnr_matched
+        if state.best == -math.inf or (finite and score.psnr_matched > state.best):  # without one the newest weights
+            state.best = score.psnr_matched if finite else state.best
             self.run.save_weights("best", self.model, state)
         self.run.save_history(state)
 
@@ -279,8 +293,7 @@ def train(
         refuse_run(Path(settings.out), replaced=force)
         validated = system.validated(model, settings)
         if not force:  # a run of an earlier version ends as it began
-            began = (Path(settings.out), "validated_frames", validated, system.window(model))
-            validated = recorded_condition(*began)
+            validated = recorded_frames(Path(settings.out), validated, system.window(model))
         windows: AnyWindows
         fixed: Subset[dict[str, Any]] | None = None
         if system.of_stream:
@@ -294,10 +307,12 @@ def train(
             lines += unfinished(settings.folders)
         conditions = {"processes": process.world, "computes_in": precision_of(settings, process.device)}
         run = Run(settings, conditions | {"clips": source_digest(windows, fixed), "validated_frames": validated})
+        trainer = Trainer(model, run, fixed, process, system)  # what fails here fails before --force removes a run
         if process.leads:
+            importlib.import_module("torch.utils.tensorboard")  # so does a missing package
             stack.enter_context(run.open(force=force))
         process.wait()
-        trainer = Trainer(model, run, fixed, process, system)
+        trainer.resume()
         if process.leads:
             for line in lines:
                 note(line)

@@ -163,6 +163,12 @@ def student_begins(network: Any) -> float:
     return 2 * TEACHING if network.config.distil else 0.0
 
 
+def check_student_teacher(network: nn.Module, settings: Settings) -> None:
+    """Raise `ValueError` for windows of more frames than teachers and student see."""
+    if settings.frames != WINDOW:
+        raise ValueError(f"--frames {settings.frames}: student-teacher learns from {WINDOW} frames; leave --frames out")
+
+
 def student_teacher_loss(network: Any, batch: Batch, settings: Settings, share: float) -> Tensor:
     """Return the loss of the part that learns now: motion teacher, noise teacher, then the student.
 

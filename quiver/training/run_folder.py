@@ -25,6 +25,7 @@ from qsim.figures import new_figure, write_figure
 from qsim.files import check_ours, read_json, write_bytes, write_json
 from qsim.locks import Lock
 from quiver.device import random_states, set_random_states
+from quiver.evaluation.json_values import json_safe
 from quiver.model import weights
 from quiver.training.optimiser import Optimiser
 from quiver.training.schedule import State
@@ -84,6 +85,15 @@ def recorded_condition(folder: Path, name: str, now: Any, earlier: Any) -> Any:
     """Return a condition of the run in a folder, `earlier` if its version wrote none, `now` where there is no run."""
     path = folder / "settings.json"
     return read_json(path).get(name, earlier) if path.is_file() else now
+
+
+def recorded_frames(folder: Path, now: int, earlier: int) -> int:
+    """Return the frames of the validation windows as `recorded_condition`; `ValueError` if the file is damaged."""
+    found = recorded_condition(folder, "validated_frames", now, earlier)
+    if type(found) is not int or found < 1:
+        path = folder / "settings.json"
+        raise ValueError(f"{path}: validated_frames is {short(found)}; the file is damaged, start again with --force")
+    return found
 
 
 class Run:
@@ -183,8 +193,9 @@ class Run:
         weights.save(model, model.config, self.folder / f"{name}.safetensors", notes)
 
     def save_history(self, state: State) -> None:
-        """Write history.json, one entry per validation."""
-        write_json(self.folder / "history.json", {"settings": self.settings.to_dict(), "history": state.history})
+        """Write history.json, one entry per validation; null stands for numbers that are not finite."""
+        content = {"settings": self.settings.to_dict(), "history": json_safe(state.history)}
+        write_json(self.folder / "history.json", content)
 
 
 def draw_curve(folder: Path, history: Sequence[Mapping[str, float]]) -> Path | None:

@@ -28,7 +28,7 @@ class Settings:
     data: str | tuple[str, ...]  # data set folder, or several
     out: str  # folder of the run
     network: str = "mergenet"  # name of the model, for the record
-    start: str | None = None  # SHA-256 of the weights file that the run starts from; None: random weights
+    start: str | None = None  # digest (weights.py) of the weights that the run starts from; None: random weights
     steps: int | None = None  # of the optimiser; with `minutes` too, the limit that is reached first ends the run
     minutes: float | None = None  # wall-clock limit, validation included
     sensor: str | tuple[str, ...] | None = None  # as given; None: those of the data set's streams
@@ -182,9 +182,10 @@ def portable(settings: Settings) -> dict[str, Any]:
         for value in (noise["defects"] or {}).values():
             if isinstance(value, dict) and "file" in value:
                 value["file"] = Path(value["file"]).name
+    drawn = [noise["sensor"] for noise in found["noise"] or ()]  # none for bit2bit, which has the sensor of its stream
+    sensors = list(dict.fromkeys(drawn or [Path(name).name for name in settings.sensors or ()]))
+    found["sensor"] = sensors[0] if len(sensors) == 1 else sensors or None
     if found["noise"]:
-        sensors = list(dict.fromkeys(noise["sensor"] for noise in found["noise"]))
-        found["sensor"] = sensors[0] if len(sensors) == 1 else sensors
         for name in ("ppp", "bits"):
             found[name] = list(dict.fromkeys(noise[name] for noise in found["noise"] if noise[name] is not None))
     return found

@@ -116,6 +116,7 @@ SYSTEMS: dict[type[nn.Module], System] = {
         *("student-teacher", rivals.student_teacher_loss, rivals.windows_restored, _protocols({}, learning_rate=3e-4)),
         still=True,
         begins=rivals.student_begins,
+        check=rivals.check_student_teacher,
     ),
     Bit2Bit: System(
         *("bit2bit", split_loss, rivals.every_frame),

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import re
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
+from qsim.files import write_json
 from quiver.evaluation.cost import checked_cases
 from quiver.restoration.interface import NETWORKS
 
@@ -43,6 +45,28 @@ def test_every_network_has_a_row_whose_options_are_known():
         modes, precisions = (text and text.split(",") for text in (plan.modes, plan.precisions))
         found = checked_cases(plan.methods.split(","), modes, precisions, None)
         assert len(found) == (6 if name == "modes" else 1)
+
+
+def test_networks_are_measured_without_a_gpu(tmp_path, monkeypatch):
+    """`quiver bench` refuses a device for classical methods."""
+    asked = []
+
+    def measured(*words: str, **options: object) -> None:
+        asked.append(words)
+        write_json(Path(words[words.index("-o") + 1]) / "bench.json", {"costs": []})
+
+    monkeypatch.setattr(bench_rows, "quiver", measured)
+    for name in ("qbp", "emvd", "modes"):
+        bench_rows.make(tmp_path / f"{name}.json", bench_rows.plan_of(name, tiny=True), busy=True)
+    assert [("--device", "cpu") in pairwise(words) for words in asked] == [False, True, True]
+
+
+def test_rows_of_another_size_share_no_page(tmp_path, monkeypatch, capsys):
+    """Whether they are asked for or not."""
+    bench_rows.store(tmp_path / "moment.json", bench_rows.plan_of("moment", tiny=True), bench_rows.Watch.now(), {})
+    monkeypatch.setattr(bench_rows, "make", lambda *words, **options: pytest.fail("made"))
+    assert bench_rows.main(["--rows", "qbp", "--busy", "--out", str(tmp_path)]) == 2
+    assert "moment.json: was made with other options" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("cost", [None, "out of memory"])

@@ -113,6 +113,19 @@ def test_python_blocks_run(path, tmp_path, monkeypatch):
             exec(compile(block.as_run, path.name, "exec", dont_inherit=True), {"__name__": path.name})
 
 
+def test_the_clip_of_one_stream_holds_the_windows_of_its_network():
+    """The page prints no size of them, and its test changes the length of the training only."""
+    from quiver.training.system import protocol
+    from quiver.training.systems import system_named
+
+    (block,) = [found for found in blocks(ROOT / "docs" / "training.md") if "--preset bit2bit" in found.body]
+    frames, height, width = map(int, re.findall(r"--(?:frames|height|width) (\d+)", block.body))
+    quick = protocol(system_named("bit2bit"), "quick")
+    assert frames >= quick["frames"]
+    assert min(height, width) >= quick["crop"]
+    assert block.words == "--minutes 20 => --steps 1"
+
+
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
 def test_commands_are_understood(words, monkeypatch):
     program = {"qsim": qsim.cli.program, "quiver": quiver.cli.program}[words[0]]

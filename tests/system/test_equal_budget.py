@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import asdict
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -104,6 +105,30 @@ def test_streams_need_validation_and_test_clips(tmp_path):
     assert len(stream_rows.clips_of(data, "test")) == 1
     with pytest.raises(ValueError, match="no clip in the split val"):
         stream_rows.clips_of(data, "val")
+
+
+def test_streams_are_learned_and_restored_without_a_gpu(tmp_path, monkeypatch):
+    """As the rows beside them."""
+    from clips import write_clip
+
+    asked, devices = {}, []
+    monkeypatch.setattr(stream_rows, "quiver", lambda *words, budget: asked.update(pairwise(words)))
+    monkeypatch.setattr(stream_rows, "restorer", lambda name, options: devices.append(options.device))
+    monkeypatch.setattr(stream_rows, "restore_clip", lambda *words: None)
+    clip = write_clip(tmp_path / "clip", frames=16)
+    stream_rows.learned("bit2bit-1m", "1e-3", 0.1, clip, argparse.Namespace(work=tmp_path / "work"), rows.TINY)
+    stream_rows.restored(tmp_path, clip, tmp_path)
+    assert (asked["--device"], asked["--minutes"], devices) == ("cpu", 0.1, ["cpu"])
+
+
+def test_rows_of_another_data_set_share_no_page(tmp_path, monkeypatch, capsys):
+    """Whether they are asked for or not: all in the folder are ranked."""
+    out = tmp_path / "rows"
+    out.mkdir()
+    rows.write_json(out / "classical.json", {"budget": asdict(rows.TINY), "data": "a", "recipe_sha256": None})
+    monkeypatch.setattr(equal_budget, "made", lambda *words: pytest.fail("made"))
+    assert equal_budget.main([str(tmp_path / "b"), "--rows", "unet", "--tiny", "--out", str(out)]) == 2
+    assert "classical.json: was made with data a; now it is b" in capsys.readouterr().err
 
 
 # ---- Busy cores

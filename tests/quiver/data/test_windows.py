@@ -17,6 +17,7 @@ from qsim.clip.photons import clip_photons, light_level
 from quiver.data.clips import open_clips
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
+from quiver.data.noise import Noise
 from quiver.data.windows import Batches, Windows, WindowSettings, windows
 
 ROOT = Path(__file__).parents[3]
@@ -214,6 +215,28 @@ def test_clips_that_hold_no_window_are_named(make_clip: ClipMaker):
         Windows([make_clip("small", frames=11)], WindowSettings(crop=40))
     with pytest.raises(ValueError, match="no complete clip"):
         Windows([], WindowSettings())
+
+
+@pytest.mark.parametrize(
+    ("noise", "message"),
+    [
+        (Noise(ppp=None, lux=10.0), "photo: its radiance is relative .* has no lux"),
+        (Noise(diffraction=True), "photo: diffraction needs a camera, .*; leave its data set out, or sense the other"),
+    ],
+    ids=["lux", "diffraction"],
+)
+def test_noise_must_fit_clips_with_and_without_a_camera(make_clip: ClipMaker, noise: Noise, message: str):
+    clips = [make_clip("lit"), make_clip("photo", relative=True)]
+    for order in (clips, clips[::-1]):
+        with pytest.raises(ValueError, match=message):
+            Windows(order, WindowSettings((noise,), crop=16))
+
+
+def test_a_defect_map_must_cover_clips_of_every_size(make_clip: ClipMaker, tmp_path):
+    np.save(tmp_path / "dead.npy", np.eye(36, 44, dtype=bool))
+    light = Illumination(sensor_file(tmp_path, QIS + 'dead_map = "dead.npy"\n', 3), 3.0, 3)
+    with pytest.raises(ValueError, match="a map must cover the frames"):
+        Windows([make_clip(), make_clip("tall", height=40)], WindowSettings((light,), crop=16))
 
 
 def test_the_pattern_moves():

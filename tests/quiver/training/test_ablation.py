@@ -1,9 +1,16 @@
-"""Tests the table of the paper's ablation: light levels stay apart, and clips of one scene count once."""
+"""Tests the ablation of the paper: Ctrl-C, light levels that stay apart, and clips of one scene that count once."""
 
 from __future__ import annotations
 
+import os
+import signal
+
+import pytest
+
+from quiver.cli.program import main
 from quiver.evaluation.comparison import ComparisonRow
 from quiver.evaluation.metrics import Score
+from quiver.training import ablation
 from quiver.training.ablation import markdown
 
 
@@ -30,3 +37,17 @@ def test_clips_of_one_scene_count_once():
 def test_a_network_without_a_score_failed():
     lost = ComparisonRow("all", "", "A", "fan", "fan", failure="ValueError: no")
     assert markdown("quiver-s", [lost]).endswith("| failed |  |\n")
+
+
+@pytest.mark.parametrize("place", ["train", "evaluate"])
+def test_ctrl_c_ends_training_and_scoring(tiny_dataset, tmp_path, monkeypatch, capsys, place):
+    def stopped(*words: object, **options: object) -> list[ComparisonRow]:
+        os.kill(os.getpid(), signal.SIGINT)
+        return []
+
+    for name in ("train", "restorer", "evaluate"):
+        monkeypatch.setattr(ablation, name, lambda *words, **options: [])
+    monkeypatch.setattr(ablation, place, stopped)
+    words = ["--steps", "1", "--crop", "16", "--threads", "1", "-q"]
+    assert main(["ablate", str(tiny_dataset), "-o", str(tmp_path / "six"), *words]) == 130
+    assert "interrupted; the same command resumes" in capsys.readouterr().err

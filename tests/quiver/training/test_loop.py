@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,7 +27,7 @@ from quiver.evaluation import metrics
 from quiver.model.blocks import RADIUS, Output
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNetConfig
-from quiver.model.weights import load
+from quiver.model.weights import load, metadata_of
 from quiver.training import loop as training
 from quiver.training.loop import Diverged, Trainer, make_windows, train
 from quiver.training.processes import Process, begin_worker
@@ -92,6 +93,28 @@ def test_a_finished_run_stays_finished(tiny_dataset, tmp_path, end):
     first = train(small_network(), ended, progress=False)
     again = train(small_network(1), ended, progress=False)
     assert (again.history, again.step) == (first.history, first.step)
+
+
+@pytest.mark.parametrize("lack", ["memory", "Muon", "tensorboard"])
+def test_a_run_is_replaced_only_by_one_that_can_start(tiny_dataset, tmp_path, monkeypatch, lack):
+    once = settings(tiny_dataset, tmp_path / "r", steps=1)
+    train(small_network(), once, progress=False)
+    before = {path.name: path.read_bytes() for path in (tmp_path / "r").iterdir()}
+    network = small_network()
+
+    def full(device: torch.device) -> nn.Module:
+        raise MemoryError
+
+    if lack == "memory":
+        monkeypatch.setattr(network, "to", full)
+    elif lack == "Muon":
+        monkeypatch.delattr(torch.optim, "Muon")
+    else:
+        monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises((MemoryError, ValueError, ModuleNotFoundError)):
+        train(network, replace(once, optimiser="muon"), progress=False, force=True)
+    assert "best.safetensors" in before
+    assert {path.name: path.read_bytes() for path in (tmp_path / "r").iterdir()} == before
 
 
 @pytest.mark.slow
@@ -363,6 +386,36 @@ def test_the_leader_tells_how_much_time_has_passed(tiny_dataset, tmp_path):
         trainer.step(torch.utils.data.default_collate([windows[n]]))
     assert trainer.state.elapsed == 30.0
     assert trainer.rate == learning_rate(run, State(step=1, elapsed=30.0))
+
+
+def scored(psnr: float) -> metrics.Score:
+    return metrics.Score(psnr, psnr, 0.5, 0.5, scale=1.0, scale_spread=0.0, frames=1)
+
+
+@pytest.mark.parametrize("value", [math.inf, math.nan])
+def test_windows_without_a_finite_score_do_not_count(tiny_dataset, tmp_path, monkeypatch, value):
+    """Such as black ones that are restored as black; a validation of them alone has no other score."""
+    found, network = itertools.chain((scored(value), scored(20.0)), itertools.repeat(scored(value))), small_network()
+    monkeypatch.setattr(metrics, "score", lambda *images: next(found))
+    windows = make_windows(settings(tiny_dataset, tmp_path / "r"), 4)[1]
+    assert len(windows) == 2
+    assert training.validate(network, windows, torch.device("cpu"), system_of(network))[0] == scored(20.0)
+    alone = training.validate(network, windows, torch.device("cpu"), system_of(network))[0].psnr_matched
+    assert str(alone) == str(value)
+
+
+@pytest.mark.parametrize("value", [math.inf, math.nan])
+def test_a_validation_without_a_finite_score_does_not_end_the_run(tiny_dataset, tmp_path, monkeypatch, value):
+    """Of three validations the second has one: its weights are the best."""
+    values = iter((value, 20.0, value))
+    monkeypatch.setattr(training, "validate", lambda *words: (scored(next(values)), torch.zeros(8, 24)))
+    once = settings(tiny_dataset, tmp_path / "r", steps=3, validate_every=1, schedule="plateau")
+    state = train(small_network(), once, progress=False)
+    assert (state.finished, state.best, state.plateau_best, state.plateau_bad) == (True, 20.0, 20.0, 0)
+    stored = json.loads((tmp_path / "r/history.json").read_text())["history"]
+    assert [entry["psnr_matched"] for entry in stored] == [None, 20.0, None]
+    assert metadata_of(tmp_path / "r/best.safetensors")["step"] == "2"
+    assert train(small_network(), once, progress=False).step == 3
 
 
 def test_validation_has_one_peak_for_every_sensor(tiny_dataset, tmp_path):

@@ -95,6 +95,17 @@ def test_a_run_of_an_earlier_version_is_validated_as_it_began(tmp_path):
     assert [recorded_condition(*words) for words in asked] == [11, 24, 40]
 
 
+@pytest.mark.parametrize("value", ["eleven", 0, True, 11.5, None])
+def test_a_damaged_number_of_frames_is_one_line(tiny_dataset, tmp_path, capsys, value):
+    with Run(settings(tiny_dataset, tmp_path / "r"), {"validated_frames": value}).open():
+        pass
+    words = ["--steps", "6", "--crop", "16", "--preset", "unet", "--threads", "1"]
+    assert main(["train", str(tiny_dataset), "-o", str(tmp_path / "r"), *words]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"validated_frames is {value!r}; the file is damaged, start again with --force" in said
+
+
 def test_one_process_at_a_time_trains_in_a_folder(tiny_dataset, tmp_path):
     """A second command is refused in one line, also with --force; the folder does not change."""
     mine = settings(tiny_dataset, tmp_path / "r")

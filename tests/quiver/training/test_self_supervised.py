@@ -27,9 +27,12 @@ from quiver.data.windows import WindowSettings
 from quiver.model.rivals.bit2bit import Bit2Bit
 from quiver.model.weights import load
 from quiver.training import loop as training
-from quiver.training.loop import train
-from quiver.training.self_supervised import config_for
+from quiver.training.loop import Trainer, train
+from quiver.training.processes import Process
+from quiver.training.run_folder import Run
+from quiver.training.self_supervised import config_for, make_stream_windows
 from quiver.training.settings import Settings
+from quiver.training.systems import system_of
 
 
 @pytest.fixture
@@ -167,6 +170,32 @@ def test_killed_and_resumed_equals_uninterrupted(stream, tmp_path, monkeypatch):
     assert (state.step, state.finished, state.history) == (4, True, [])
     assert same_weights(through, resumed)
     assert same_weights(load(tmp_path / "b/best.safetensors"), resumed)
+
+
+class Second(Process):
+    """The second of two processes, without the first."""
+
+    def from_leader(self, number: float) -> float:
+        return number
+
+    def any(self, condition: bool) -> bool:
+        return condition
+
+
+def test_of_several_processes_each_splits_by_its_samples(stream, tmp_path, monkeypatch):
+    """The stored random state is the leader's: a resumed process draws what it would have drawn."""
+    monkeypatch.setattr(torch.nn.parallel, "DistributedDataParallel", lambda module, **options: module)
+    run, codes, losses = settings_of(stream, tmp_path / "r"), stream_at(stream), []
+    windows = make_stream_windows(run)
+    batch = torch.utils.data.default_collate([windows[2], windows[3]])
+    for seed, first in ((1, 2), (5, 2), (5, 6)):
+        network = small(codes)
+        trainer = Trainer(network, Run(run), None, Second(1, 2, torch.device("cpu")), system_of(network))
+        torch.manual_seed(seed)
+        trainer.step(batch | {"sample": torch.tensor([first, first + 1])})
+        losses.append(trainer.loss)
+    assert losses[0] == losses[1]
+    assert losses[1] != losses[2]
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import math
 import pytest
 from runs import settings
 
-from quiver.training.settings import PROTOCOLS, Settings
+from quiver.training.settings import PROTOCOLS, Settings, portable
 
 
 def test_protocols_are_those_of_the_paper_and_its_program():
@@ -24,6 +24,15 @@ def test_protocols_are_those_of_the_paper_and_its_program():
 def test_every_level_and_depth_is_mixed():
     lights = Settings("d", "o", steps=1, ppp=(3.25, 26.0), bits=(1, 3)).lights
     assert {(light.ppp, light.bits) for light in lights} == {(3.25, 1), (3.25, 3), (26.0, 1), (26.0, 3)}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "found"),
+    [("/home/me/my.toml", "my.toml"), (("a/my.toml", "spad512s"), ["my.toml", "spad512s"]), (None, None)],
+)
+def test_weights_state_a_sensor_without_its_folder(tmp_path, sensor, found):
+    """Also those of a run on a stream, whose settings have no noise."""
+    assert portable(settings(tmp_path, tmp_path, sensor=sensor))["sensor"] == found
 
 
 @pytest.mark.parametrize(

@@ -344,6 +344,7 @@ def test_every_preset_has_a_system_and_a_quick_protocol():
         ("rvrt", {"loss": "l1"}, "--loss l1: rvrt is trained with own; leave --loss out"),
         ("unet", {"loss": "own"}, "trained with published or paper or l1 or scales-l1"),
         ("mergenet", {"frames": 12}, "--frames 12: mergenet restores from 11 frames; leave --frames out"),
+        ("student-teacher", {"frames": 20}, "--frames 20: student-teacher learns from 11 frames; leave --frames out"),
         ("bit2bit", {"schedule": "plateau"}, "--schedule plateau: follows validations, and bit2bit has none; leave it"),
     ],
 )
