@@ -23,7 +23,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.figures import new_figure, write_figure
-from qsim.files import VERSION, sha256, write_bytes, write_json
+from qsim.files import VERSION, write_bytes, write_json
 from qsim.formats.warped_pictures import FINE, Layer, Path2D, frame
 from qsim.keys import Key
 from qsim.scene.textures import photograph
@@ -31,6 +31,7 @@ from qsim.tables import markdown_table
 from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
+from quiver.model.weights import digest
 from quiver.restoration.automatic import chosen
 from quiver.restoration.restorers import weights_path
 
@@ -172,7 +173,7 @@ def main(words: list[str] | None = None) -> int:
         print(f"restorer_bits: give --scenes of at least 1 and --size of {4 * EDGE} to 256", file=sys.stderr)
         return 2
     rows = {f"{m:g}": [measured(n, args.size, m) for n in range(args.scenes)] for m in MOTION}
-    weights = sha256(weights_path("mergenet"))
+    weights = digest(weights_path("mergenet"))
     args.out.parent.mkdir(parents=True, exist_ok=True)
     same = {"format": "quiver-restorer-bits-1", "quiver": VERSION, "weights": weights, "size": args.size}
     write_json(args.out.with_suffix(".json"), same | {"motion": rows})

@@ -22,13 +22,14 @@ from PIL import Image, ImageDraw
 
 from qsim import colour
 from qsim.clip.clip import Clip
-from qsim.files import VERSION, sha256, write_bytes, write_json
+from qsim.files import VERSION, write_bytes, write_json
 from qsim.tables import markdown_table
 from quiver.data.clips import mean_light, open_clips, peak_of, truth
 from quiver.data.codes import Codes, array_codes, sensed
 from quiver.data.illumination import Illumination
 from quiver.data.photon_counts import Counts, read_counts
 from quiver.evaluation.static_object import counted, evaluate_static, reference, seen_by
+from quiver.model.weights import digest
 from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer, restorers, weights_path
 
@@ -180,7 +181,7 @@ def main(words: list[str] | None = None) -> int:
         found = {
             "format": "quiver-restorer-checks-1",
             "quiver": VERSION,
-            "weights": sha256(weights_path(args.restorer)),
+            "weights": digest(weights_path(args.restorer)),
             "clips": len(clips),
             "shift": shifts(clips, (RIVAL, args.restorer)),
             "photons": {

@@ -24,13 +24,14 @@ import numpy as np
 
 from qsim.clip.clip import Clip
 from qsim.figures import new_figure, write_figure
-from qsim.files import VERSION, read_json, sha256, write_bytes, write_json
+from qsim.files import VERSION, read_json, write_bytes, write_json
 from qsim.tables import markdown_table
 from quiver.data.clips import known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
 from quiver.evaluation.breakdown import bin_names, by_motion, pooled, speeds
+from quiver.model.weights import digest
 from quiver.restoration.restorers import restorer, weights_path
 
 ROOT = Path(__file__).parents[1]
@@ -74,7 +75,7 @@ def main(words: list[str] | None = None) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
         for name in names:
             grow(args.out / f"{name}.json", every[name], clips, args)
-        weights = sha256(weights_path(args.restorer))
+        weights = digest(weights_path(args.restorer))
         known = [name for name in every if measured_with(args.out / f"{name}.json", weights)]
         write_tables(args.out, known, [clip.name for clip in clips])
     except (ValueError, OSError) as error:
@@ -106,7 +107,7 @@ def measured_with(path: Path, weights: str) -> bool:
 def grow(path: Path, place: Place, clips: Sequence[Clip], args: argparse.Namespace) -> None:
     """Measure what a cell lacks, and write it after every clip. `ValueError` if it was measured otherwise."""
     same = {"format": FORMAT, "quiver": VERSION, "frames": args.frames}
-    tried = {"restorer": args.restorer, "weights": sha256(weights_path(args.restorer))}
+    tried = {"restorer": args.restorer, "weights": digest(weights_path(args.restorer))}
     found = read_json(path) if path.exists() else {**same, "name": place.name, "scores": {}}
     changed = [key for key, value in same.items() if found.get(key) != value]
     if changed:

@@ -20,13 +20,14 @@ import numpy as np
 from numpy import ndarray as Array
 from restorer_bits import EDGE, scene
 
-from qsim.files import VERSION, sha256, write_bytes, write_json
+from qsim.files import VERSION, write_bytes, write_json
 from qsim.formats.warped_pictures import frame
 from qsim.keys import Key
 from qsim.tables import markdown_table
 from quiver.data.codes import Codes, array_codes, filled
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
+from quiver.model.weights import digest
 from quiver.restoration.domain_remarks import light_change
 from quiver.restoration.restorers import restorer, weights_path
 
@@ -305,7 +306,7 @@ def main(words: list[str] | None = None) -> int:
         print(f"restorer_limits: give --draws of at least 2 and --size of {4 * EDGE} to 256", file=sys.stderr)
         return 2
     parts = (fields, planes, dark, short, defects, faults, changing, details)
-    found = {"format": "quiver-restorer-limits-2", "quiver": VERSION, "weights": sha256(weights_path(NAME))}
+    found = {"format": "quiver-restorer-limits-2", "quiver": VERSION, "weights": digest(weights_path(NAME))}
     found |= {"draws": args.draws, "size": args.size}
     found |= {part.__name__: part(args.draws, args.size) for part in parts}
     args.out.parent.mkdir(parents=True, exist_ok=True)

@@ -23,9 +23,10 @@ from restorer_grid import FRAMES, Place, measured, places
 from rows import keep_apart
 
 from qsim.clip.clip import Clip
-from qsim.files import VERSION, read_json, sha256, write_bytes, write_json
+from qsim.files import VERSION, read_json, write_bytes, write_json
 from qsim.tables import markdown_table
 from quiver.data.clips import open_clips
+from quiver.model.weights import digest
 from quiver.restoration.restorers import weights_path
 
 ROOT = Path(__file__).parents[1]
@@ -62,7 +63,7 @@ def main(words: list[str] | None = None) -> int:
             raise ValueError(f"{args.test}: no finished clip in split 'test'; finish `qsim generate`")
         for name in args.cells.split(","):
             path = args.out / f"{name}.json"
-            same = {"format": FORMAT, "quiver": VERSION, "start": sha256(weights_path(START)), "size": vars(size)}
+            same = {"format": FORMAT, "quiver": VERSION, "start": digest(weights_path(START)), "size": vars(size)}
             if not path.exists():
                 row = compared(known[name], clips, args, size)
                 args.out.mkdir(parents=True, exist_ok=True)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
+import math
 import os
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -102,7 +103,7 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver.training.run_folder import draw_curve
 
     first = None if args.start is None else weights_path(args.start)
-    args.start = None if first is None else sha256(first)
+    args.start = None if first is None else _start(args, first)
     args.data = args.data[0] if len(args.data) == 1 else tuple(args.data)
     settings = _settings(args)
     if args.preset.startswith("bit2bit"):
@@ -119,8 +120,9 @@ def _run_train(args: argparse.Namespace) -> int:
     earlier = None if args.force else threads.recorded(folder / "settings.json")
     settings = replace(settings, threads=use_threads(args, earlier))
     torch.manual_seed(settings.seed)
+    interrupted: list[int] = []
     try:
-        with _signals() as interrupted:
+        with _signals(interrupted):
             state = train(
                 network_of(args, settings, first),
                 settings,
@@ -139,6 +141,17 @@ def _run_train(args: argparse.Namespace) -> int:
         print("quiver: interrupted; the same command resumes where it stopped", file=sys.stderr)
         return 130
     return 0
+
+
+def _start(args: argparse.Namespace, first: Path) -> str:
+    """Return the digest of the first weights; that of their file where a run of an earlier version began with it."""
+    from quiver.model.weights import digest
+    from quiver.training.run_folder import recorded_condition
+
+    earlier = sha256(first)
+    if not args.force and recorded_condition(Path(args.output), "start", None, None) == earlier:
+        return earlier
+    return digest(first)
 
 
 def _settings(args: argparse.Namespace) -> Any:
@@ -190,26 +203,26 @@ def network_of(args: argparse.Namespace, settings: Any, first: Path | None = Non
     return loaded.train()
 
 
-@contextlib.contextmanager
-def _signals() -> Iterator[list[int]]:
+def _signals(found: list[int]) -> AbstractContextManager[None]:
     """Collect Ctrl-C and termination instead of ending: the loop ends after its step and saves its state."""
-    found: list[int] = []
-    with handling(lambda number, _: found.append(number), signal.SIGINT, signal.SIGTERM):
-        yield found
+    return handling(lambda number, _: found.append(number), signal.SIGINT, signal.SIGTERM)
 
 
 def _summary(folder: Path, state: Any) -> tuple[dict[str, Any], str]:
+    from quiver.evaluation.json_values import json_safe
+
     found = {"run": str(folder), "steps": state.step, "seconds": state.elapsed}
     text = f"{folder}: {state.step} steps in {state.elapsed / 60:.1f} min"
     weights = str(folder / "best.safetensors")
     if state.history:
         found |= {"best_psnr_matched": state.best, "weights": weights, "last_validation": state.history[-1]}
-        text += f", best validation PSNR {state.best:.2f} dB (after the best factor): {weights}"
+        best = f"best validation PSNR {state.best:.2f} dB (after the best factor)"
+        text += f", {best if math.isfinite(state.best) else 'no validation has a finite PSNR'}: {weights}"
         text += _drop_after(state.best, state.history)
     elif state.finished:
         found |= {"weights": weights}
         text += f": {weights}"
-    return found, text
+    return json_safe(found), text
 
 
 def _drop_after(best: float, history: Sequence[Mapping[str, float]]) -> str:
@@ -217,7 +230,8 @@ def _drop_after(best: float, history: Sequence[Mapping[str, float]]) -> str:
     last = history[-1]["psnr_matched"]
     if not last < best - 0.005:
         return ""
-    minutes = max(history, key=lambda entry: entry["psnr_matched"])["elapsed"] / 60
+    known = [entry for entry in history if math.isfinite(entry["psnr_matched"])]
+    minutes = max(known, key=lambda entry: entry["psnr_matched"])["elapsed"] / 60
     return (
         f"\nit then got worse: the last validation is {best - last:.2f} dB below the best, of minute {minutes:.1f}, "
         "whose weights are kept"
@@ -269,9 +283,15 @@ def _run_ablate(args: argparse.Namespace) -> int:
             note(line)
         lights = tuple(noise.simple for noise in settings.noise or ())
         comparison = Comparison(args.data, args.split, lights, settings.seed)
-        with _signals() as interrupted:
-            options, show = running_options(args), not (args.json or args.quiet)
-            found = run_ablation(settings, comparison, options, should_stop=lambda: bool(interrupted), progress=show)
+        interrupted: list[int] = []
+        found = run_ablation(
+            settings,
+            comparison,
+            running_options(args),
+            should_stop=lambda: bool(interrupted),
+            while_training=_signals(interrupted),
+            progress=not (args.json or args.quiet),
+        )
     except Diverged as error:
         text = _without_force(error, "choose another --protocol or --seed, and another -o")
         return failed(f"quiver: {text}", DIVERGED, args.json)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.files import read_json, write_json
+from quiver import threads
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import Codes, Stream, array_codes, sensed, stored, windows_sensed
 from quiver.data.illumination import Illumination, read_sensor
@@ -144,6 +145,7 @@ def restore_clip(
     """
     name, (precision, cut) = comparison.label(light), settings_of(method, codes)
     row = ComparisonRow(method.name, method.description, name, clip.name, scene_of(clip), precision=precision, cut=cut)
+    row = replace(row, device=method.device, threads=threads.current())
     frames = scored_frames(len(clip), comparison.published)
     white = peak_in_photons(comparison, clip, codes, factor)
     target, valid = truth(clip, factor, frames.start, frames.stop) / white, known(clip, frames.start, frames.stop)
@@ -234,9 +236,14 @@ def evaluate(
             label = comparison.label(light)
             codes: Codes | None = None
             for method in methods:
-                asked = (method.name, method.description, label, clip.name, *settings_of(method, drawn))
-                earlier = (*asked[:-1], None)
-                key = earlier if earlier in known else asked
+                precision, cut = settings_of(method, drawn)
+                keys = [
+                    (method.name, one.description, label, clip.name, precision, tiles)
+                    for one in (method, method.earlier)
+                    if one is not None
+                    for tiles in (cut, None)  # None: an earlier version did not record them
+                ]
+                key = next((one for one in keys if one in known), keys[0])
                 if progress is not None:
                     progress(f"{method.name}, {clip.name}, {label}", len(rows), total)
                 if key not in known:

@@ -35,6 +35,8 @@ class ComparisonRow:
     failure: str | None = None
     precision: str = RestoreOptions.precision
     cut: str | None = None  # tiles of a frame where they change the answer, else empty; None: not recorded earlier
+    device: str | None = None  # where it was restored; None: not recorded earlier
+    threads: int | None = None  # of torch; None: not recorded earlier, or without torch
 
     @property
     def key(self) -> tuple[str, str, str, str, str, str | None]:

@@ -11,7 +11,6 @@ from typing import Any
 from qsim.figures import new_figure, write_figure
 from qsim.files import write_bytes, write_json
 from qsim.tables import markdown_table
-from quiver import threads
 from quiver.evaluation import breakdown, metrics
 from quiver.evaluation.comparison import FORMAT, PUBLISHED_EDGE, Comparison, ComparisonRow
 from quiver.evaluation.json_values import json_safe
@@ -52,8 +51,10 @@ class SummaryLine:
     scale: float  # best factor, mean over clips
     scale_spread: float  # standard deviation over clips, or over windows where every window has its own
     psnr_by_motion: list[float]  # dB, matched, all pixels of a bin of breakdown.EDGES pooled; NaN = no pixel
-    seconds_per_frame: float
-    peak_bytes: int | None  # of memory, largest over clips
+    seconds_per_frame: float  # NaN where devices or threads differ
+    peak_bytes: int | None  # of memory, largest over clips; None where devices or threads differ
+    devices: tuple[str | None, ...]  # where the clips were restored; None: not recorded
+    threads: tuple[int | None, ...]  # of torch; None: not recorded
     above_peak: float  # share of target pixels above the peak, largest over clips
     truth_psnr: float | None  # dB, mean over clips
     near_truth: tuple[str, ...]  # PSNR scores within metrics.NEAR_TRUTH of that of the truth, in some clip
@@ -82,6 +83,9 @@ def _line(method: str, light: str, rows: Sequence[ComparisonRow]) -> SummaryLine
     moved = [row for row, _ in good if row.motion_pixels]
     by_frames = [(s.psnr_matched, s.frames) for _, s in good if s.frames]
     truths = [row.truth_psnr for row, _ in good if row.truth_psnr is not None]
+    devices = tuple(dict.fromkeys(row.device for row, _ in good))
+    threads = tuple(dict.fromkeys(row.threads for row, _ in good))
+    alike = [row for row, _ in good if len(devices) == len(threads) == 1]
     return SummaryLine(
         method=method,
         light=light,
@@ -90,8 +94,10 @@ def _line(method: str, light: str, rows: Sequence[ComparisonRow]) -> SummaryLine
         scale=mean(scales),
         scale_spread=within if within > 0 else spread,
         psnr_by_motion=breakdown.pooled([row.motion_pixels for row in moved], [row.motion_squares for row in moved]),
-        seconds_per_frame=mean([row.seconds_per_frame for row, _ in good]),
-        peak_bytes=max((row.peak_bytes for row, _ in good if row.peak_bytes is not None), default=None),
+        seconds_per_frame=mean([row.seconds_per_frame for row in alike]),
+        peak_bytes=max((row.peak_bytes for row in alike if row.peak_bytes is not None), default=None),
+        devices=devices,
+        threads=threads,
         above_peak=max((score.above_peak for _, score in good), default=math.nan),
         truth_psnr=mean(truths) if truths else None,
         near_truth=tuple(name for name in SCORES[:2] if any(near_truth(row, name) for row, _ in good)),
@@ -145,7 +151,7 @@ def markdown(
     lines = summarise(rows)
     text += markdown_table([_cells(line, by_name[line.method], comparison.published) for line in lines], COLUMNS)
     text += ["", *_caveats(lines, rows), *[f"{remark}\n" for remark in remarks]]
-    text += [MEMORY, ""]
+    text += [MEMORY, "", *_mixed(lines)]
     failures = [f"- {line.method}, {line.light}, {reason}" for line in lines for reason in line.failures]
     text += ["## Failures", "", *failures, ""] if failures else []
     return "\n".join([*text, *_by_motion(lines), *_per_scene(rows)]) + "\n"
@@ -182,7 +188,8 @@ def _cells(line: SummaryLine, method: Restorer, published: bool) -> list[str]:
             for name in SCORES
         ]
         cells += [*scores[:2], _number(line.psnr_matched_per_frame, 2), *scores[2:]]
-        cells += [f"{line.scale:.3f} (spread {line.scale_spread:.3f})", f"{line.seconds_per_frame:.3g}"]
+        cells += [f"{line.scale:.3f} (spread {line.scale_spread:.3f})"]
+        cells += ["-" if math.isnan(line.seconds_per_frame) else f"{line.seconds_per_frame:.3g}"]
         cells += ["-" if line.peak_bytes is None else f"{line.peak_bytes / 1e6:.0f} MB"]
         cells += [f"{100 * line.above_peak:.1f} %"]
         cells += ["not measured" if line.truth_psnr is None else f"{line.truth_psnr:.1f}"]
@@ -202,6 +209,16 @@ def _caveats(lines: Sequence[SummaryLine], rows: Sequence[ComparisonRow]) -> lis
             "error of the truth is a large part of this score.\n"
         )
     return text
+
+
+def _mixed(lines: Sequence[SummaryLine]) -> list[str]:
+    """Return a note on the lines whose clips were restored on several devices or by several numbers of threads."""
+    told = []
+    for line in lines:
+        if max(len(line.devices), len(line.threads)) > 1:
+            devices, threads = (", ".join(str(x or "not recorded") for x in xs) for xs in (line.devices, line.threads))
+            told.append(f"{line.method}, {line.light} (devices: {devices}; threads: {threads})")
+    return [f"No time and memory, because not all clips were restored alike: {'; '.join(told)}.", ""] if told else []
 
 
 def _seen_by(comparison: Comparison) -> str:
@@ -245,19 +262,17 @@ def as_dict(
             "plan": comparison.to_dict(),
             "peak": peak_name(comparison),
             "remarks": list(remarks),
-            "threads": threads.current(),
             "methods": [
                 {
                     "name": m.name,
                     **dict(zip(("frames", "future"), frames_of(m, published=comparison.published), strict=True)),
                     "learned": m.learned,
-                    "device": m.device,
                     "is": m.description,
                 }
                 for m in methods
             ],
             "table": [json_safe(asdict(line), infinite=True) for line in summarise(rows)],
-            "rows": [asdict(row) for row in rows],
+            "rows": [json_safe(asdict(row), infinite=True) for row in rows],
         }
     )
     return found

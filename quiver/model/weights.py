@@ -3,6 +3,7 @@
 No pickled code is executed: our files are safetensors, and torch reads other checkpoints with `weights_only=True`.
 """
 
+import hashlib
 import json
 import pickle
 import warnings
@@ -127,6 +128,20 @@ def load(path: Path) -> nn.Module:
 def metadata_of(path: Path) -> dict[str, str]:
     """Return the notes of a safetensors file; FileNotFoundError or ValueError for any other file."""
     return read_safetensors(path)[1]
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of what decides results: format, network, configuration and tensors; errors as `metadata_of`.
+
+    Other notes, such as measured cells, do not count.
+    """
+    tensors, metadata = read_safetensors(path)
+    about = [metadata.get(key) for key in ("format", "network", "config")]
+    kinds = [[name, str(value.dtype), list(value.shape)] for name, value in sorted(tensors.items())]
+    found = hashlib.sha256(json.dumps([about, kinds]).encode())
+    for name in sorted(tensors):
+        found.update(tensors[name].reshape(-1).view(torch.uint8).numpy().data)
+    return found.hexdigest()
 
 
 def annotate(path: Path, notes: Mapping[str, str]) -> None:

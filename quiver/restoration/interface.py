@@ -76,6 +76,7 @@ class Restorer:
     together: int = 1  # frames that are restored at a time and share most of the work
     scope: Scope | None = None  # of a network: the streams that it was measured for or trained on; None: not known
     device: str = "cpu"  # where it runs
+    earlier: Restorer | None = None  # with the description and identity that earlier versions stored, if they differ
 
     def restore(self, codes: Codes, first: int = 0, last: int | None = None, progress: Progress | None = None) -> Array:
         """Return photons, float32 [last - first, H, W], of frames first ... last - 1; of all frames by default.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.files import Progress
+from qsim.files import Progress, sha256
 from quiver.baselines.sliding_window import reflect
 from quiver.data.clips import peak_of
 from quiver.data.codes import Codes, frame_reader, light_of
@@ -34,15 +33,17 @@ CONTEXT = 5  # frames that a network needs before and after the one it restores
 
 def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
     """Return the network of a weights file; a training run is named after its folder."""
-    from quiver.model.weights import load, metadata_of
+    from quiver.model.weights import digest, load, metadata_of
     from quiver.restoration.domain import read_scope
 
     model = load(path)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
     name = Path(os.path.abspath(path)).parent.name if path.name == "best.safetensors" else path.stem
-    description = f"{network_title(model)}, weights {digest[:12]}"
-    method = wrap_network(model, name, description, options, weights_sha256=digest)
-    return replace(method, scope=read_scope(path, metadata_of(path)))
+
+    def described(known: str) -> Restorer:
+        description = f"{network_title(model)}, weights {known[:12]}"
+        return wrap_network(model, name, description, options, weights_sha256=known)
+
+    return replace(described(digest(path)), scope=read_scope(path, metadata_of(path)), earlier=described(sha256(path)))
 
 
 def network_title(model: nn.Module) -> str:
@@ -59,7 +60,7 @@ def network_title(model: nn.Module) -> str:
 def wrap_network(
     model: nn.Module, name: str, description: str, options: RestoreOptions, weights_sha256: str | None = None
 ) -> Restorer:
-    """Return a network as a method; the checksum is that of its weights file."""
+    """Return a network as a method; the checksum is that of its weights."""
     from quiver.model.blocks import RADIUS, WINDOW
     from quiver.model.mergenet import MergeNet
     from quiver.model.quiver import QUIVER

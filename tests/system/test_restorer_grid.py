@@ -116,7 +116,7 @@ def test_only_what_is_missing_is_measured(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(restorer_grid, "CLASSICAL", ("naive", "moment:3"))
     assert restorer_grid.main(words) == 0
     assert [names for _, names in calls[2:]] == [["moment:3"]] * 2
-    monkeypatch.setattr(restorer_grid, "sha256", lambda path: "1" * 64)
+    monkeypatch.setattr(restorer_grid, "digest", lambda path: "1" * 64)
     assert restorer_grid.main(words) == 0
     assert [names for _, names in calls[4:]] == [["restorer"]] * 2
     told = json.loads(path.read_text())

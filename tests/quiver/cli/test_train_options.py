@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,10 +14,12 @@ from domains import weights
 from safetensors.torch import load_file
 from sensor_files import FILES, sensor_file
 
+from qsim.files import sha256
 from quiver.cli.program import main
 from quiver.evaluation import domain_measurement
 from quiver.evaluation.cost import checked_cases
 from quiver.evaluation.metrics import Score
+from quiver.model.weights import annotate
 from quiver.training import ablation, loop
 from quiver.training.run_folder import alone_in
 
@@ -88,6 +91,34 @@ def test_an_option_changes_the_weights(tiny_dataset, tmp_path, words):
     plain = trained(tiny_dataset, tmp_path / "a")
     other = trained(tiny_dataset, tmp_path / "b", *words)
     assert any(not torch.equal(plain[name], other[name]) for name in plain)
+
+
+def test_a_run_knows_its_first_weights_by_what_decides_results(capsys, tiny_dataset, tmp_path):
+    """Notes of the file may change; a run of an earlier version holds the digest of the file, which then may not."""
+    trained(tiny_dataset, tmp_path / "a")
+    first, path = tmp_path / "a/last.safetensors", tmp_path / "b/settings.json"
+    words = ("--start", str(first))
+    trained(tiny_dataset, tmp_path / "b", *words)
+    annotate(first, {"step": "7"})
+    trained(tiny_dataset, tmp_path / "b", *words)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"start": sha256(first)}))
+    trained(tiny_dataset, tmp_path / "b", *words)
+    annotate(first, {"step": "8"})
+    capsys.readouterr()
+    assert "holds a run with start" in told(capsys, "train", tiny_dataset, "-o", tmp_path / "b", *FAST, *words, "-q")
+
+
+@pytest.mark.parametrize("psnr", [math.inf, math.nan])
+def test_a_run_without_a_finite_score_keeps_its_newest_weights(tiny_dataset, tmp_path, monkeypatch, capsys, psnr):
+    score = Score(psnr, psnr, 1.0, 1.0, scale=1.0, scale_spread=0.0, frames=1)
+    monkeypatch.setattr(loop, "validate", lambda *words: (score, torch.zeros(8, 24)))
+    words = ["train", str(tiny_dataset), "-o", str(tmp_path / "r"), *FAST, "--threads", "1"]
+    assert main([*words, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert (found["best_psnr_matched"], found["last_validation"]["psnr"]) == (None, None)
+    assert Path(found["weights"]).is_file()
+    assert main(words) == 0
+    assert "2 steps in 0.0 min, no validation has a finite PSNR: " in capsys.readouterr().out
 
 
 def one_bit_file(folder: Path) -> str:

@@ -127,12 +127,28 @@ def test_rows_of_another_precision_or_cut_are_not_taken(make_clip: ClipMaker, tm
     assert calls == ["float32 ", "bfloat16 ", "float32 4 tiles of at most 9 x 12"]
     assert [row.precision for row in rows] == ["float32", "bfloat16", "float32", "bfloat16", "float32"]
 
-    earlier = {name: value for name, value in json.loads(lines[0]).items() if name not in ("precision", "cut")}
+    new = ("precision", "cut", "device", "threads")
+    earlier = {name: value for name, value in json.loads(lines[0]).items() if name not in new}
     (out / "rows.jsonl").write_text(json.dumps(earlier) + "\n")
     calls.clear()
     for run in runs:
         evaluate(comparison, [network(**run)], out)
     assert calls == ["bfloat16 "]
+
+
+def test_rows_that_name_the_digest_of_the_weights_file_are_taken(make_clip: ClipMaker, tmp_path):
+    """So did earlier versions; the row keeps its description, by which its crops are named."""
+    comparison, out = Comparison(str(make_clip(frames=4).path), None), tmp_path / "t"
+    calls: list[str] = []
+
+    def restore(codes: Codes) -> Array:
+        calls.append(codes.name)
+        return np.ones(codes.shape)
+
+    before = method("net", restore, learned=True)
+    rows = evaluate(comparison, [before], out)
+    assert evaluate(comparison, [replace(before, description="U-Net, weights 12", earlier=before)], out) == rows
+    assert len(calls) == 1
 
 
 def test_a_run_without_memory_for_a_tile_is_a_failure(make_clip: ClipMaker):
@@ -454,4 +470,5 @@ def test_memory_is_that_of_the_device_of_the_method(make_clip: ClipMaker, monkey
     rows = evaluate(comparison, methods)
     assert kinds == ["cpu", "cuda"]
     assert [row.peak_bytes for row in rows] == [1000, 2000]
-    assert [one["device"] for one in summary.as_dict(comparison, methods, rows)["methods"]] == ["cpu", "cuda"]
+    assert [row.device for row in rows] == ["cpu", "cuda"]
+    assert [line["devices"] for line in summary.as_dict(comparison, methods, rows)["table"]] == [["cpu"], ["cuda"]]

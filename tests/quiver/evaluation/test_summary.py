@@ -129,5 +129,28 @@ def test_frames_of_a_method_lie_in_the_published_window(window, future, seamless
 def test_an_infinite_score_is_stored_as_one():
     score = Score(math.inf, math.inf, 1.0, 1.0, scale=1.0, scale_spread=0.0, frames=3)
     rows = [ComparisonRow("exact", "", "3.25 PPP, 3 bit", "fan", "fan", score)]
-    (line,) = summary.as_dict(Comparison("data"), [], rows)["table"]
-    assert line["scores"]["psnr_matched"] == {"mean": "inf", "half_width": None, "scenes": 1}
+    found = summary.as_dict(Comparison("data"), [], rows)
+    assert found["table"][0]["scores"]["psnr_matched"] == {"mean": "inf", "half_width": None, "scenes": 1}
+    assert found["rows"][0]["score"]["psnr_matched"] == "inf"
+
+
+def test_clips_of_several_devices_have_no_common_time():
+    """Their mean was shown, beside the device and the threads of the last call."""
+    light, net = "3.25 PPP, 3 bit", method("net", lambda codes: codes)
+    first = ComparisonRow("net", "", light, "a", "a", Score(20.0, 21.0, 0.5, 0.6, 1.0, 0.0, frames=3), 1.0, 5_000_000)
+    first = replace(first, device="cuda", threads=4)
+    second = replace(first, clip="b", scene="b", seconds_per_frame=3.0)
+    rows = [first, replace(second, device="cpu", threads=1)]
+    line = summary.as_dict(Comparison("data"), [net], rows)["table"][0]
+    assert (line["devices"], line["threads"]) == (["cuda", "cpu"], [4, 1])
+    assert (line["seconds_per_frame"], line["peak_bytes"]) == (None, None)
+    text = summary.markdown(Comparison("data"), [net], rows)
+    assert "| - | - |" in text
+    assert "not all clips were restored alike: net, 3.25 PPP, 3 bit (devices: cuda, cpu; threads: 4, 1)." in text
+    earlier = [replace(row, device=None, threads=None) for row in (first, second)]  # versions that recorded none
+    for alike in ([first, second], earlier):
+        assert "| 2 | 5 MB |" in (text := summary.markdown(Comparison("data"), [net], alike))
+        assert "restored alike" not in text
+    assert "(devices: cuda, not recorded; threads: 4, not recorded)" in summary.markdown(
+        Comparison("data"), [net], [first, earlier[1]]
+    )

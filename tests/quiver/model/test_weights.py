@@ -26,7 +26,7 @@ from quiver.model.presets import OTHERS
 from quiver.model.quiver import QUIVER
 from quiver.model.rivals.emvd import EMVD, EMVDConfig
 from quiver.model.unet import UNet, UNetConfig
-from quiver.model.weights import EARLIER, RENAMED_PARTS, load, save
+from quiver.model.weights import EARLIER, RENAMED_PARTS, annotate, digest, load, save
 from quiver.restoration.restorers import weights_path
 
 EARLIER_TINY = TINY.to_dict() | EARLIER  # sizes that are fixed now were fields
@@ -52,6 +52,30 @@ def test_saved_networks_come_back_the_same(tmp_path: Path, name):
     for name, value in network.state_dict().items():
         assert torch.equal(back.state_dict()[name], value), name
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_digest_is_that_of_what_decides_results(tmp_path: Path):
+    """That of the file changed with every measurement of cells, which are a note in it."""
+    path = tmp_path / "w.safetensors"
+    tensors = {"a": torch.arange(4.0).reshape(2, 2), "b": torch.ones(()), "c": torch.ones(0)}
+    about = {"format": "quiver-1", "network": "UNet", "config": "{}"}
+    save_file(tensors, path, about)
+    before = digest(path)
+    annotate(path, {"domain": "cells"})
+    assert notes(path)["domain"] == "cells"
+    assert digest(path) == before
+    changed = [
+        (tensors | {"a": tensors["a"] + 1}, about),
+        (tensors | {"a": tensors["a"].flatten()}, about),
+        (tensors | {"a": tensors["a"].view(torch.int32)}, about),
+        ({"d" if name == "a" else name: value for name, value in tensors.items()}, about),
+        *((tensors, about | {key: "other"}) for key in about),
+    ]
+    found = {before}
+    for values, metadata in changed:
+        save_file(values, path, metadata)
+        found.add(digest(path))
+    assert len(found) == len(changed) + 1
 
 
 def earlier(network: nn.Module, config: dict[str, object], path: Path) -> None:
