@@ -300,7 +300,7 @@ MISTAKES = [
     ("quiver evaluate none -o x --protocol x4k1000fps", "none: no such folder; name the folder of the test set"),
     ("quiver evaluate data -o x --protocol x4k1000fps --bits 3", "--bits: --protocol x4k1000fps decides it; leave it"),
     ("quiver evaluate data -o x --methods naive,,moment", "expected names with commas between them"),
-    ("quiver evaluate data -o lit", "lit exists and is not an evaluation; choose another -o"),
+    ("quiver evaluate data -o lit", "lit: is a clip, which holds nothing else; name another folder"),
     ("quiver evaluate --static light.npy", "light.npy: expected whole counts [N, H, W] or [T, K, H, W], got float32"),
 ]
 
