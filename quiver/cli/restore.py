@@ -70,6 +70,7 @@ def add_restore(sub: Any) -> None:
 
 def _run_restore(args: argparse.Namespace) -> int:
     from quiver import threads
+    from quiver.data.clips import check_outside
     from quiver.restoration.automatic import chosen
     from quiver.restoration.restored_file import restore_to_file, unnamed
     from quiver.restoration.sources import assumed, codes_to_restore, refuse_idle
@@ -79,6 +80,7 @@ def _run_restore(args: argparse.Namespace) -> int:
         return _restore_cubes(args)
     if target.suffix != ".npy":
         raise ValueError(f"{target}: restored video is written as .npy; name a .npy file")
+    check_outside(target)
     codes = codes_to_restore(args)
     for path in (target, target.with_suffix(".json")):
         if path.exists() and not args.force and not unnamed(target):  # restore_to_file finishes its naming

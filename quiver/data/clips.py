@@ -9,6 +9,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip import Clip
+from qsim.clip.manifest import check_outside
 from qsim.clip.photons import clip_photons
 from qsim.dataset.dataset import Dataset
 from qsim.files import sha256, to_json
@@ -16,6 +17,7 @@ from qsim.optics.radiometry import WHITE_PER_MEAN
 
 __all__ = [
     "Clip",
+    "check_outside",
     "clips_digest",
     "has_sharp",
     "known",

@@ -251,6 +251,7 @@ MISTAKES = [
     ("qsim report empty -o text.txt/sub/x.html", "text.txt: is a file where a folder is needed; name another with -o"),
     ("qsim render fan -o text.txt/x", "text.txt: is a file where a folder is needed; name another with -o"),
     ("qsim convert lit text.txt/x.npy", "text.txt: is a file where a folder is needed"),
+    ("quiver restore lit -o lit/streams/x.npy --ppp 3", "lit, which holds nothing else; name another place"),
     ("quiver restore lit -o text.txt/x.npy --ppp 3 --method moment", "text.txt: is a file where a folder is needed"),
     ("qsim report lit -o x.pdf", "x.pdf: a page is a .html file, as in -o x.html"),
     ("qsim explore lit -o x.pdf", "x.pdf: a page is a .html file, as in -o x.html"),
