@@ -184,12 +184,6 @@ class Trainer:
         self.system = system
         self.model, self.run, self.fixed, self.process = model.to(process.device).train(), run, fixed, process
         self.optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
-        objective = Objective(model, system.loss, settings)
-        self.parallel = (
-            nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
-            if process.world > 1
-            else objective
-        )
         self.low = precision_of(settings, process.device) == "bfloat16"
         self.board: Board | None = None
         self.state = State()
@@ -200,6 +194,12 @@ class Trainer:
     def resume(self) -> None:
         """Continue from the newest state in the folder, if there is one."""
         self.state = self.run.load(self.model, self.optimiser)
+        objective = Objective(self.model, self.system.loss, self.run.settings)
+        self.parallel = (
+            nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
+            if self.process.world > 1
+            else objective
+        )
         self.started, self.saved = time.monotonic() - self.state.elapsed, time.monotonic()
 
     def step(self, batch: dict[str, Any]) -> None:

@@ -406,7 +406,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         "--force",
         "",
         Acts(f"{SCORE} --seed 1", "--force", scores, codes=(0, 2), before=SCORE),
-        Refused(SCORE.replace("-o table", "-o clip"), "--force", "removes only what this command made"),
+        Refused(SCORE.replace("-o table", "-o clip"), "--force", "holds nothing else"),
     ),
     # domain
     ("domain", "--split"): of_measuring(
