@@ -65,8 +65,8 @@ LIMITS = """Thirty minutes cannot tell which network is best after days of train
 the same time, and recurrent ones learn late. A row states what a design gives for this budget on these clips. All
 networks are trained by Adam, mergenet too, whose own protocol has Muon. bit2bit trains on the streams that it restores
 and stands apart. The speed of the machine differed from row to row: one with a slower reference convolution made fewer
-steps than it could. An earlier version of this program made the rows flornn-1m (windows of eleven frames) and rvrt-1m
-(crops of 80 px, higher rates)."""
+steps than it could. Earlier versions made the rows flornn-1m (windows of eleven frames) and rvrt-1m (crops of 80 px,
+higher rates), and QBP, QBP + BM3D and Transform Denoise, whose frames near the ends of clips are others since."""
 APART = "bit2bit"  # begins the names of networks that learn from the streams they restore
 
 
