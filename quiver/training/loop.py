@@ -184,23 +184,18 @@ class Trainer:
         self.system = system
         self.model, self.run, self.fixed, self.process = model.to(process.device).train(), run, fixed, process
         self.optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
-        self.low = precision_of(settings, process.device) == "bfloat16"
-        self.board: Board | None = None
-        self.state = State()
-        self.started = self.saved = time.monotonic()
-        self.loss, self.rate = math.nan, math.nan  # of the last step
-        self.validation = 0.0  # s, duration of the last one
-
-    def resume(self) -> None:
-        """Continue from the newest state in the folder, if there is one."""
-        self.state = self.run.load(self.model, self.optimiser)
-        objective = Objective(self.model, self.system.loss, self.run.settings)
+        self.state = run.load(model, self.optimiser)
+        objective = Objective(model, system.loss, settings)
         self.parallel = (
             nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
-            if self.process.world > 1
+            if process.world > 1
             else objective
         )
+        self.low = precision_of(settings, process.device) == "bfloat16"
+        self.board: Board | None = None
         self.started, self.saved = time.monotonic() - self.state.elapsed, time.monotonic()
+        self.loss, self.rate = math.nan, math.nan  # of the last step
+        self.validation = 0.0  # s, duration of the last one
 
     def step(self, batch: dict[str, Any]) -> None:
         """Update the weights by one batch; `Diverged` if its loss or gradient is not finite."""
@@ -307,12 +302,12 @@ def train(
             lines += unfinished(settings.folders)
         conditions = {"processes": process.world, "computes_in": precision_of(settings, process.device)}
         run = Run(settings, conditions | {"clips": source_digest(windows, fixed), "validated_frames": validated})
-        trainer = Trainer(model, run, fixed, process, system)  # what fails here fails before --force removes a run
+        Optimiser(model.to(process.device), settings.optimiser, settings.learning_rate, settings.betas)
         if process.leads:
-            importlib.import_module("torch.utils.tensorboard")  # so does a missing package
+            importlib.import_module("torch.utils.tensorboard")  # this and the line above fail before a run is removed
             stack.enter_context(run.open(force=force))
         process.wait()
-        trainer.resume()
+        trainer = Trainer(model, run, fixed, process, system)
         if process.leads:
             for line in lines:
                 note(line)
