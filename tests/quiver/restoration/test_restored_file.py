@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import resource
+import shutil
 import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
@@ -311,14 +312,19 @@ def test_many_writers_of_one_video(tmp_path):
 
 def test_force_replaces_restored_video_only(tmp_path, make_clip, capsys):
     """Not a stream, whose json lies where the video's would, not the array that is being restored, nor another."""
-    stream, _ = sense(make_clip(frames=3), Sensing("quiver-physical", bits=3, ppp=3.25, name="mine"))
+    made, _ = sense(make_clip(frames=3), Sensing("quiver-physical", bits=3, ppp=3.25, name="mine"))
+    stream = tmp_path / "mine.npy"
+    for suffix in (".npy", ".json"):
+        shutil.copy(made.path.with_suffix(suffix), stream.with_suffix(suffix))
     np.save(tmp_path / "a.npy", random_codes().read(0, 10))
     np.save(tmp_path / "cube.npy", random_codes(seed=1).read(0, 10))
-    own = (stream.path, stream.path.with_suffix(".json"), tmp_path / "a.npy", tmp_path / "cube.npy")
+    own = (stream, stream.with_suffix(".json"), made.path, tmp_path / "a.npy", tmp_path / "cube.npy")
     held = {path: path.read_bytes() for path in own}
     words = ["--method", "naive", "--force"]
-    assert main(["restore", str(stream.path), "-o", str(stream.path), *words]) == 2
+    assert main(["restore", str(stream), "-o", str(stream), *words]) == 2
     assert "does not describe restored video" in capsys.readouterr().err
+    assert main(["restore", str(made.path), "-o", str(made.path), *words]) == 2
+    assert "which holds nothing else; name another place" in capsys.readouterr().err
     array = ["restore", str(tmp_path / "a.npy"), "--sensor", "quiver-paper"]
     assert main([*array, "-o", str(tmp_path / "." / "a.npy"), *words]) == 2
     assert "would be replaced by what is made from it" in capsys.readouterr().err
