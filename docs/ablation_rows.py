@@ -160,7 +160,8 @@ def write_table(out: Path) -> None:
         cells += [", ".join(str(row["steps"]) for row in own)]
         for key, digits in (("psnr_matched", 2), ("ssim_matched", 3)):
             found = [row["scores"][key]["mean"] for row in own]
-            cells.append("n/a" if None in found else f"{np.mean(found):.{digits}f} ± {np.ptp(found) / 2:.{digits}f}")
+            spread = f" ± {np.ptp(found) / 2:.{digits}f}" if len(found) > 1 and None not in found else ""
+            cells.append("n/a" if None in found else f"{np.mean(found):.{digits}f}{spread}")
         table.append([*cells, ", ".join(starred(row, row["seed"]) for row in own)])
     header = ("pre-denoiser", "flow", "multi-scale", "parameters", "steps", "PSNR matched", "SSIM matched", "seeds")
     steps = rows[0]["budget"].get("steps") if rows else None

@@ -169,11 +169,11 @@ def apart(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, Any]
 
 
 def trial(name: str, rate: str, folder: Path, data: Path, budget: Budget) -> dict[str, Any]:
-    """Return the PSNR [dB] of the last validation of a short run, None if it diverged, and its curve."""
+    """Return the PSNR [dB] of the last validation of a short run, None if it diverged or has none, and its curve."""
     if not converged(partial(train, name, rate, folder, data, budget, short=True)):
         return {"psnr": None, "curve": []}
     curve = read_json(folder / "history.json")["history"]
-    return {"psnr": float(curve[-1]["psnr_matched"]), "curve": curve}
+    return {"psnr": curve[-1]["psnr_matched"], "curve": curve}
 
 
 def classical(args: argparse.Namespace, budget: Budget, lights: tuple[str, ...] = LIGHTS) -> dict[str, Any]:
@@ -272,7 +272,8 @@ def ranked(networks: list[dict[str, Any]], classical: dict[str, Any], floor: flo
     lines = []
     for name, lights in classical["scores"].items():
         found = lights[at]
-        spent = [f"{found['seconds_per_frame']:.3g}", "", speed(classical)]
+        seconds = found["seconds_per_frame"]  # None where the method failed
+        spent = ["n/a" if seconds is None else f"{seconds:.3g}", "", speed(classical)]
         lines.append((mean_of(found), ["", name, *[""] * 6, *score_cells(found), *spent]))
     order = sorted(networks, key=lambda row: -mean_of(row["scores"][at]))
     for rank, row in enumerate(order, 1):
@@ -288,7 +289,9 @@ def width_cells(row: dict[str, Any], floor: float, at: str) -> list[str]:
     found = row["scores"].get(at)
     score = interval(found["scores"]["psnr_matched"], 2) if found and mean_of(found) >= floor else "below"
     macs, _, *others = size_cells(row)
-    return [starred(row), macs, *others, f"{row['curve'][-1]['psnr_matched']:.2f}", score, *cost_cells(row), speed(row)]
+    last = row["curve"][-1]["psnr_matched"]
+    validated = "n/a" if last is None else f"{last:.2f}"
+    return [starred(row), macs, *others, validated, score, *cost_cells(row), speed(row)]
 
 
 def mean_of(found: dict[str, Any]) -> float:
@@ -342,7 +345,7 @@ def light_cells(rows: list[dict[str, Any]]) -> list[list[str]]:
 def curves(record: list[dict[str, Any]], widths: list[dict[str, Any]], path: Path) -> None:
     """Draw validation PSNR over minutes: the table of record and, once they have rows, the published widths."""
     parts = [("a million multiply-adds", record)] + [("published widths", widths)] * bool(widths)
-    figure = new_figure(5 * len(parts), 4.5)
+    figure = new_figure(5 * len(parts), 5.2)
     axes = figure.subplots(1, len(parts), sharey=True, squeeze=False)[0]
     for axis, (title, rows) in zip(axes, parts, strict=True):
         for i, row in enumerate(rows):
@@ -352,7 +355,7 @@ def curves(record: list[dict[str, Any]], widths: list[dict[str, Any]], path: Pat
         axis.set_title(title)
         axis.set_xlabel("minutes of training")
         if rows:
-            axis.legend(fontsize="x-small")
+            axis.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4)
     axes[0].set_ylabel("validation PSNR after the best factor [dB]")
     write_figure(figure, path)
 
