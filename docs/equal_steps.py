@@ -78,7 +78,8 @@ def write_table(out: Path) -> None:
         found = one["scores"][AT]
         below = FLOOR in plain and mean_of(found) < mean_of(plain[FLOOR])
         size = (f"{one['macs_per_pixel'] / 1e6:.3g} M", f"{one['parameters']:,}", f"{one['rate']:g}")
-        last = f"{one['curve'][-1]['psnr_matched']:.2f}"
+        validated = one["curve"][-1]["psnr_matched"]
+        last = "n/a" if validated is None else f"{validated:.2f}"
         frames = f"{one['window']}, {one['look_ahead']}"
         cells = ["none" if below else str(rank), one["name"], frames, *size, last, *score_cells(found)]
         lines.append((mean_of(found), cells))
