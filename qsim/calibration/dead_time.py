@@ -17,13 +17,15 @@ from math import sqrt
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.calibration.frame_statistics import FrameStatistics, alike, measure
+from qsim.calibration.frame_statistics import FrameStatistics, alike, as_codes, measure
 from qsim.calibration.results import Calibration, Value, normal_interval
 from qsim.sensor.counting import CountingSPAD
 
 CLASSES = 8
 LEAST_MEAN = 1.0  # counts; darker pixels hold no information about dead time
 LEAST_PIXELS = 50  # in a class
+
+_BLOCK = 1 << 22  # values that are checked at a time
 
 
 @dataclass(frozen=True)
@@ -67,29 +69,33 @@ def fitted_dead_time(flats: Sequence[FrameStatistics], bits: int, paralyzable: b
 
 
 def _fano_residuals(flats: Sequence[FrameStatistics], bits: int, ratio: float, paralyzable: bool) -> list[float]:
-    """Return (observed variance - variance of a dead-time pixel of the same mean) / sigma, per flat.
+    """Return (observed variance - variance of dead-time pixels of the same mean) / sigma, per flat.
 
+    The variance bends with the mean, so a spread of light between the pixels changes its average to second order.
     Sigma comes from the model's moments: those of the data would count the pattern of the pixels as noise.
     """
     residuals = []
     codes = np.arange(1 << bits, dtype=float)
     sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
     for flat in flats:
-        arrivals, expected, slope = matched_variance(flat.mean, bits, ratio, paralyzable)
+        arrivals, expected, slope, bend = matched_variance(flat.mean, bits, ratio, paralyzable)
         pmf = np.exp(sensor.log_pmf(np.array(arrivals), 1.0))
         centred = codes - pmf @ codes
         third, fourth = float(pmf @ centred**3), float(pmf @ centred**4)
         v = max(expected, 1e-12)
         n = flat.pixels * (flat.frames - 1)
-        spread = max(fourth - v**2 + slope**2 * v - 2 * slope * third, 1e-12) / n
-        residuals.append((flat.variance - expected) / sqrt(spread))
+        noise = max(fourth - v**2 + slope**2 * v - 2 * slope * third, 1e-12) / n
+        if flat.pixels > 1:
+            expected += bend / 2 * min(flat.fixed_pattern, (flat.mean / 2) ** 2)
+        residuals.append((flat.variance - expected) / sqrt(noise))
     return residuals
 
 
-def matched_variance(mean: float, bits: int, ratio: float, paralyzable: bool) -> tuple[float, float, float]:
-    """Return (arrivals, variance, d variance / d mean) of a counting pixel of this mean code; tau/T = `ratio`.
+def matched_variance(mean: float, bits: int, ratio: float, paralyzable: bool) -> tuple[float, float, float, float]:
+    """Return arrivals and variance of a counting pixel of this mean code, and the variance's two derivatives by it.
 
-    Newton's method on the rising branch. If no light gives this mean, the variance is 0, which no data match.
+    tau/T = `ratio`. Newton's method on the rising branch. If no light gives this mean, the variance is 0, which no data
+    match.
     """
     sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
     arrivals = mean
@@ -98,15 +104,17 @@ def matched_variance(mean: float, bits: int, ratio: float, paralyzable: bool) ->
         slope = -float(np.sum(sensor.dcdf(at, 1.0)[:-1]))
         excess = float(sensor.mean(at, 1.0)) - mean
         if slope < 0.02:  # the mean is near its maximum or falls: no light gives it with this dead time
-            return arrivals, 0.0, 0.0
+            return arrivals, 0.0, 0.0, 0.0
         step = float(np.clip(excess / slope, -0.5 * arrivals - 0.1, 0.5 * arrivals))
         arrivals -= step
         if abs(step) < 1e-9 * max(arrivals, 1e-6):
             break
-    h = 1e-4 * max(arrivals, 1e-3)
+    h = 1e-3 * max(arrivals, 1e-4)
     at = np.array([arrivals - h, arrivals, arrivals + h])
     variance, means = sensor.variance(at, 1.0), sensor.mean(at, 1.0)
-    return arrivals, float(variance[1]), float((variance[2] - variance[0]) / (means[2] - means[0]))
+    below, above = np.diff(variance) / np.diff(means)
+    bend = 2 * float(above - below) / float(means[2] - means[0])
+    return arrivals, float(variance[1]), float((variance[2] - variance[0]) / (means[2] - means[0])), bend
 
 
 def classes_of(
@@ -130,26 +138,37 @@ def classes_of(
 
 
 def fano(stack: FrameStatistics) -> Value:
-    """Return variance over mean in time with its 95 % interval; the error of the mean is negligible."""
+    """Return variance over mean in time with its 95 % interval.
+
+    Its variance is 2 F^2 / n, exactly for Poisson counts; a dead time changes that by at most 0.25/mean above F = 0.25.
+    """
     n = stack.pixels * (stack.frames - 1)
-    poisson_fourth = stack.mean + 3 * stack.mean**2
-    spread = (poisson_fourth - stack.mean**2) / n / stack.mean**2
-    return normal_interval(stack.variance / stack.mean, spread, "variance / mean", f"{stack.pixels} pixels")
+    value = stack.variance / stack.mean
+    return normal_interval(value, 2 * value**2 / n, "variance / mean", f"{stack.pixels} pixels")
 
 
 def calibrate_static(
-    counts: Array, *, bits: int, exposure: float, edges: Sequence[float] | None = None, paralyzable: bool = False
+    counts: Array,
+    *,
+    bits: int,
+    exposure: float,
+    edges: Sequence[float] | None = None,
+    paralyzable: bool = False,
+    name: str = "stack",
 ) -> Calibration:
     """Estimate the effective dead time [s] and the Fano factor of every class, from counts [T, H, W] of a static scene.
 
-    `exposure` in seconds. `ValueError` for fewer than two frames, for frames that are all alike, and if no
-    class has enough pixels.
+    `exposure` in seconds. `ValueError` for fewer than two frames, for frames that are all alike, if no class has enough
+    pixels, and for values that are not codes (with `name`, frame and pixel). Light that changes gives a warning.
     """
     counts = np.asarray(counts)
     if counts.ndim != 3 or len(counts) < 2:
         raise ValueError(
             f"calibrate: a static scene is counts [T, H, W] of at least 2 frames, got {list(counts.shape)}"
         )
+    step = max(1, _BLOCK // max(counts[0].size, 1))
+    for start in range(0, len(counts), step):
+        as_codes(counts[start : start + step], bits, name, start)
     stacks = classes_of(counts, bits=bits, exposure=exposure, edges=edges)
     if not stacks:
         raise ValueError(f"calibrate: no class of light has {LEAST_PIXELS} pixels; use a larger part of the scene")
@@ -163,21 +182,18 @@ def calibrate_static(
     if found:
         method = "Fano factor against flux, static scene"
         values["dead_time"] = normal_interval(ratio * exposure, found.variance * exposure**2, "s", method, floor=0.0)
-    residuals = tuple(
-        np.array([(stack.variance - matched_variance(stack.mean, bits, ratio, paralyzable)[1]) / _sigma(stack)])
-        for stack in stacks
-    )
-    return Calibration("CountingSPAD", bits, values, _p_value(residuals), (), residuals, paralyzable=paralyzable)
+    residuals = _fano_residuals(stacks, bits, ratio, paralyzable)
+    p_value = _p_value(residuals, fitted=int(ratio > 0))
+    warnings: tuple[str, ...] = ()
+    if p_value < 1e-3:
+        warnings = (f"the fitted dead time does not describe the counts (p = {p_value:.1g}): is the scene static?",)
+    drawn = tuple(np.array([residual]) for residual in residuals)
+    return Calibration("CountingSPAD", bits, values, p_value, warnings, drawn, paralyzable=paralyzable)
 
 
-def _sigma(stack: FrameStatistics) -> float:
-    """Return the standard error of the mean variance, from the fourth moment of Poisson counts."""
-    return sqrt((stack.mean + 2 * stack.mean**2) / (stack.pixels * (stack.frames - 1)))
-
-
-def _p_value(residuals: tuple[Array, ...]) -> float:
-    """Return the p-value of the classes' variances against the fitted curve: chi-square, one fitted parameter."""
+def _p_value(residuals: Sequence[float], fitted: int) -> float:
+    """Return the chi-square p-value of the classes' variances against the curve; a dead time of 0 is not fitted."""
     from scipy.stats import chi2
 
-    freedom = len(residuals) - 1
-    return float(chi2.sf(sum(float(r[0] ** 2) for r in residuals), freedom)) if freedom > 0 else float("nan")
+    freedom = len(residuals) - fitted
+    return float(chi2.sf(sum(r * r for r in residuals), freedom)) if freedom > 0 else float("nan")

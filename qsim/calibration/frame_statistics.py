@@ -103,7 +103,7 @@ def measure(
     frames, sums = 0, None
     histogram = np.zeros(1 << bits, np.int64)
     for block in blocks:
-        codes = _as_codes(block, bits, name, frames)
+        codes = as_codes(block, bits, name, frames)
         histogram += np.bincount(codes.ravel(), minlength=histogram.size)
         values = codes.astype(np.float64)
         if sums is None:
@@ -166,8 +166,8 @@ def _check_light(exposure: float, photons: float | None, name: str) -> None:
         raise ValueError(f"{name}: photons are a number of at least 0 (0 = dark), got {photons!r}")
 
 
-def _as_codes(block: Array, bits: int, name: str, frame: int) -> Array:
-    """Return a block as integers [t, H, W]."""
+def as_codes(block: Array, bits: int, name: str, frame: int) -> Array:
+    """Return a block of a stack, from frame number `frame`, as integers [t, H, W]; `ValueError` as `measure`."""
     return _as_values(block, (1 << bits) - 1, f"code of {bits} bits", name, frame)
 
 

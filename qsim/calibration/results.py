@@ -46,6 +46,14 @@ def normal_interval(value: float, variance: float, unit: str, method: str, *, fl
     return Value(max(value, floor), max(value - reach, floor), max(value + reach, floor), unit, method)
 
 
+def poisson_interval(value: float, count: float, unit: str, method: str) -> Value:
+    """Return the exact interval of a value that is proportional to a Poisson count of at least 1."""
+    from scipy.stats import chi2
+
+    low, high = float(chi2.ppf(0.025, 2 * count)) / 2, float(chi2.ppf(0.975, 2 * count + 2)) / 2
+    return Value(value, value * low / count, value * high / count, unit, method)
+
+
 def log_interval(value: float, log_variance: float, unit: str, method: str) -> Value:
     """Return value times e^(+-1.96 sigma): the interval of a positive scale."""
     factor = exp(min(Z95 * sqrt(max(log_variance, 0.0)), 700.0))

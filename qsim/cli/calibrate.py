@@ -153,8 +153,11 @@ def _static(args: argparse.Namespace, bits: int) -> Any:
     from qsim.calibration.dead_time import calibrate_static
     from qsim.calibration.sensor_file import read_counts
 
-    counts = read_counts(Path(args.static[0]), args.variable)
-    return calibrate_static(counts, bits=bits, exposure=_number(args.static[1]), paralyzable=args.paralyzable)
+    path = Path(args.static[0])
+    counts = read_counts(path, args.variable)
+    return calibrate_static(
+        counts, bits=bits, exposure=_number(args.static[1]), paralyzable=args.paralyzable, name=str(path)
+    )
 
 
 def _number(word: str) -> float:

@@ -98,6 +98,7 @@ def test_options_that_cannot_act_are_refused(folder, capsys, words, message):
         ("--bits 4 --static full.npy 1e-5", "all frames are alike, which determines no dead time"),
         ("--bits 4 --static none.npy 1e-5", "no pixel has a mean above 1 counts; more light is needed"),
         ("--bits 4 --static one.npy 1e-5", "of at least 2 frames, got [1, 40, 40]"),
+        ("--bits 4 --static large.npy 1e-5", "large.npy: 300 at (t, y, x) = (3, 20, 30) is not a code of 4 bits"),
         ("--model spad --bits 8 --dark none.npy 1e-5 --flat same.npy 1e-5 9", "all frames of flat 0 are alike"),
         ("--model spad --bits 4 --dark none.npy 1e-5 --flat full.npy 1e-5", "all frames of flat 0 are alike"),
         ("--model spad --bits 4 --dark full.npy 1e-5", "all frames of dark 0 are alike"),
@@ -116,6 +117,8 @@ def test_frames_that_determine_nothing_are_refused(tmp_path, monkeypatch, capsys
     one = rng.integers(2, 14, (1, 40, 40), np.uint8)
     stacks = {"one": one, "same": one.repeat(5, axis=0), "noise": rng.integers(0, 4, (5, 40, 40), np.uint8)}
     stacks |= {name: np.full((5, 40, 40), code, np.uint8) for name, code in (("full", 15), ("ones", 1), ("none", 0))}
+    stacks["large"] = rng.integers(2, 14, (5, 40, 40), np.uint16)
+    stacks["large"][3, 20, 30] = 300
     for name, stack in stacks.items():
         np.save(f"{name}.npy", stack)
     assert main(["calibrate", *words.split(), "-o", "x.toml"]) == 2
