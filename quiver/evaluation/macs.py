@@ -18,11 +18,11 @@ from quiver.model.rivals.bit2bit import Bit2BitConfig
 
 FRAMES = (12, 22)  # of two clips; networks repeat themselves after 10 frames at most
 LONG = (32, 64)  # of bit2bit, which restores pieces of 32 frames
-SIDE = 128  # px
+SIDE = 128  # px, of the clips; twice that for a network that would extend them
 
 
 def design_macs(config: Any) -> float:
-    """Return those of the network of a configuration, per pixel of one more frame of a long clip of 128 x 128 px.
+    """Return those of the network of a configuration, per pixel of one more frame of a long clip of SIDE x SIDE px.
 
     Nothing is computed: tensors have a shape and no values.
     """
@@ -44,7 +44,10 @@ def macs(network: nn.Module, frames: int, height: int, width: int) -> int:
 def macs_per_pixel(network: nn.Module, frames: tuple[int, int] = FRAMES, side: int = SIDE) -> float:
     """Return the multiply-accumulates per pixel of one more frame of a clip of side x side px.
 
-    The difference of two clips, of so many `frames`, leaves out what the ends of a clip cost.
+    The difference of two clips, of so many `frames`, leaves out what the ends of a clip cost. For a network that
+    extends such frames to its least size, the side is doubled until it does not.
     """
+    while getattr(network, "least", 1) > side:
+        side *= 2
     short, long = (macs(network, count, side, side) for count in frames)
     return (long - short) / ((frames[1] - frames[0]) * side**2)

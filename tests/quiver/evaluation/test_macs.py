@@ -8,8 +8,10 @@ from quiver.evaluation.macs import design_macs, macs, macs_per_pixel
 from quiver.model.equal_cost import EQUAL_COST
 from quiver.model.mergenet import MergeNetConfig
 from quiver.model.presets import made
+from quiver.model.rivals.edges import pad_space
 from quiver.model.rivals.emvd import EMVDConfig
 from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
+from quiver.model.rivals.rvrt import RVRTConfig
 from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
 from quiver.model.unet import UNetConfig
 from quiver.restoration.interface import COMPARED
@@ -60,6 +62,25 @@ def test_published_sizes_cost_what_is_published():
     pixels = 256**2
     assert macs_per_pixel(FastDVDnet().eval(), (1, 2), 16) * pixels == pytest.approx(20.6e9, rel=0.003)
     assert macs_per_pixel(StudentTeacher().eval(), (1, 2), 16) * pixels == pytest.approx(85.4e9, rel=0.001)
+
+
+class Extended(nn.Conv2d):
+    """A layer of 9 per pixel that extends small frames, as RVRT does."""
+
+    least = 12  # px
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return super().forward(pad_space(frames, 1, self.least).flatten(0, 1))
+
+
+def test_frames_that_a_network_would_extend_are_not_counted():
+    assert macs_per_pixel(Extended(1, 1, 3, padding=1), (2, 4), 8) == 9
+
+
+@pytest.mark.slow
+def test_rvrt_costs_what_its_layers_cost():
+    """Added up from the layers; of frames of 128 px, which it extends to 132 px, 981 143 were counted."""
+    assert design_macs(RVRTConfig()) == pytest.approx(744_091, rel=1e-3)
 
 
 SLOW = ("memdeblur", "rvrt", "spk2imgnet", "flornn", "emvd", "quiver-s")  # three to twelve seconds
