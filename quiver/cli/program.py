@@ -88,6 +88,7 @@ def _add_convert_weights(sub: Any) -> None:
 
 def _run_convert_weights(args: argparse.Namespace) -> int:
     from quiver.model.published_weights import convert_weights
+    from quiver.restoration.domain import UP_TO_A_FACTOR
 
     if args.output.suffix != ".safetensors":
         raise ValueError(f"{args.output}: weights are written as .safetensors; name a .safetensors file with -o")
@@ -101,7 +102,8 @@ def _run_convert_weights(args: argparse.Namespace) -> int:
         network = convert_weights(args.source, args.output)
     parameters = sum(p.numel() for p in network.parameters())
     found = {"weights": str(args.output), "channels": network.config.channels, "parameters": parameters}
-    output(args, found, f"{args.output}: {network.config.channels} channels, {parameters:,} parameters")
+    size = f"{network.config.channels} channels, {parameters:,} parameters"
+    output(args, found, f"{args.output}: {size}; {UP_TO_A_FACTOR}")
     return 0
 
 

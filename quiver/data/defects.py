@@ -25,12 +25,13 @@ from qsim.clip.stream import Stream
 from qsim.keys import Key
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.defect_table import from_dict as read_defects
+from qsim.sensor.defects.good_pixels import behind as behind
+from qsim.sensor.defects.good_pixels import defective
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
 
 NEIGHBOURS = 8  # good pixels that a defective one is filled from
 STAGE = 4  # of the random keys
-HOT = 0.1  # dark detections over those of the mean light, from which on a pixel counts as hot
 
 
 class Filler:
@@ -59,45 +60,9 @@ class Filler:
         return filled
 
 
-def defective(
-    defects: Defects | None,
-    sensor: Sensor,
-    exposure: float,
-    light: float,
-    shape: tuple[int, int],
-    origin: tuple[int, int] = (0, 0),
-) -> Array | None:
-    """Return the dead and the hot pixels, bool [H, W], of a sensor with defects; None without any.
-
-    A pixel is hot if its dark detections per exposure [s] exceed HOT times those of the mean light [photons]. Of a
-    clocked sum, `sensor` and `exposure` are those of the sum. `origin` (y, x) places a crop in the full frame.
-    """
-    if defects is None:
-        return None
-    array = PixelArray.of(defects, sensor, *shape, origin)
-    bad = np.zeros(shape, bool) if array.maps.dead is None else np.array(array.maps.dead)
-    if array.maps.dark is not None:
-        bad |= array.maps.dark * array.sensor.dark_rate * exposure > HOT * light * array.sensor.efficiency
-    return bad if bad.any() else None
-
-
 def as_measured(defects: Defects | None, sensor: Sensor, shape: tuple[int, int]) -> Sensor:
     """Return a sensor with the mean dark rate of its measured map for frames [H, W]; the same without a map."""
     return sensor if defects is None else PixelArray.of(defects, sensor, *shape).sensor
-
-
-def behind(bad: Array | None, defects: Defects | None, sensor: Sensor, origin: tuple[int, int] = (0, 0)) -> Sensor:
-    """Return the sensor of filled codes: its dark rate is the mean of the good pixels, bool [H, W] `bad` being false.
-
-    The mean over all pixels belongs mostly to the hot ones. Restored light would be too dark by their share of it.
-    """
-    if bad is None or defects is None:
-        return sensor
-    height, width = bad.shape
-    array = PixelArray.of(defects, sensor, height, width, origin)
-    if array.maps.dark is None or bad.all():
-        return sensor
-    return sensor.with_dark_rate(array.sensor.dark_rate * float(array.maps.dark[~bad].mean()))
 
 
 def of_draw(draw: Draw, exposure: float, shape: tuple[int, int]) -> Array | None:

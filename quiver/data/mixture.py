@@ -37,8 +37,9 @@ def choose(
 ) -> Mixture:
     """Return the noise of the clips' streams, changed to the requested sensors, light levels [photons/pixel] and bits.
 
-    Where sensors are requested, their streams are taken if there are any. Without streams, the default sensor and light
-    are used. `ValueError` for a stream whose noise training windows cannot have.
+    A requested sensor has the light, bits and defects of its own streams. Without any, it has light and bits of other
+    streams, and the defects of its own file. Without streams, the default sensor and light are used. `ValueError` for
+    a stream whose noise training windows cannot have.
     """
     asked = bool(sensors or ppp or bits)
     streams = _streams(clips)
@@ -50,13 +51,15 @@ def choose(
         default = "" if found else "the default; the data set has no streams"
         return Mixture(found or (Noise(),), default, found)
     base = tuple(noise for noise in found if noise.sensor in (sensors or ())) or found or (Noise(),)
-    asked_for = [
-        _changed(noise, sensor, level, depth)
-        for noise in base
-        for sensor in sensors or (None,)
-        for depth in bits or (None,)
-        for level in ppp or (None,)
-    ]
+    asked_for: list[Noise] = []
+    for sensor in sensors or (None,):
+        own = tuple(noise for noise in base if noise.sensor == sensor) or base
+        asked_for += [
+            _changed(noise, sensor, level, depth)
+            for noise in own
+            for depth in bits or (None,)
+            for level in ppp or (None,)
+        ]
     return Mixture(_unique(asked_for), "as asked for", found)
 
 

@@ -17,13 +17,14 @@ from qsim.keys import Key
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
-from quiver.data.codes import Codes, codes_of, open_stream, stream_codes
+from quiver.data.codes import Codes, codes_of, light_of, open_stream, stream_codes
 from quiver.data.window_noise import WindowPlace
 from quiver.data.windows import WindowSettings, as_input, turned
 
 COUNTING = (0.9, 1.25)  # codes per electron at which codes of a QIS are photon counts, nearly
 BLACK = 0.1  # codes: the largest offset of such a QIS
 BLUR = 0.3  # e- rms: its largest read noise, with which nine codes in ten are the electrons
+LOST = 0.05  # of the events of the mean light: the largest loss, by which restored light is too dark
 
 
 @dataclass(frozen=True)
@@ -43,15 +44,15 @@ def law_of(codes: Codes) -> Law:
     reason = _no_counts(codes)
     if reason is not None:
         raise ValueError(
-            f"{codes.name}: {reason} and no photon counts of one kind, which bit2bit needs; give a stream of summed "
-            "planes, or of about one code per electron with little read noise and no offset"
+            f"{codes.name}: {reason}; bit2bit needs photon counts of one kind: give a stream of summed planes, or of "
+            "about one code per electron with little read noise, no offset and rare saturation"
         )
     dark = sensor.dark_rate * exposure / (sensor.efficiency * sensor.white(exposure))
     return Law(isinstance(sensor, BinarySPAD), float(dark))
 
 
 def _no_counts(codes: Codes) -> str | None:
-    """Return what the codes of a stream are instead of photon counts of one kind; None if they are such."""
+    """Return why the codes of a stream are no photon counts of one kind; None if they are such."""
     sensor = codes.sensor
     if codes.colour is not None:
         return "its codes are those of colour filters"
@@ -59,14 +60,20 @@ def _no_counts(codes: Codes) -> str | None:
         return "its codes are those of different exposures"
     if isinstance(sensor, SpikeCamera):
         return "its codes are spikes of collected charge"
-    if not isinstance(sensor, QIS):
+    if isinstance(sensor, BinarySPAD):
         return None
-    if not COUNTING[0] <= sensor.gain <= COUNTING[1]:
-        return f"its codes are {sensor.gain:.3g} per electron"
-    if abs(sensor.offset) > BLACK:
-        return f"its codes are shifted by an offset of {sensor.offset:.3g}"
-    if sensor.read_noise > BLUR:
-        return f"its codes are blurred by a read noise of {sensor.read_noise:.3g} electrons"
+    if isinstance(sensor, QIS):
+        if not COUNTING[0] <= sensor.gain <= COUNTING[1]:
+            return f"its codes are {sensor.gain:.3g} per electron"
+        if abs(sensor.offset) > BLACK:
+            return f"its codes are shifted by an offset of {sensor.offset:.3g}"
+        if sensor.read_noise > BLUR:
+            return f"its codes are blurred by a read noise of {sensor.read_noise:.3g} electrons"
+    light = light_of(codes)
+    counts = getattr(sensor, "gain", 1.0) * (sensor.efficiency * light + sensor.dark_rate * codes.exposure)
+    lost = 1 - float(sensor.mean(np.array([light]), codes.exposure)[0]) / counts
+    if lost > LOST:
+        return f"its codes lose {100 * lost:.0f} % of the events of the mean light to saturation, dead time or rounding"
     return None
 
 

@@ -140,6 +140,7 @@ def markdown(
         )
         + "; mean ± half-width of the 95 % interval over scenes (clips of one scene averaged first"
         + ("; there is only one, hence no interval" if len({row.scene for row in rows}) == 1 else "")
+        + ("; clips that state no scene count as one each" if any(row.scene == row.clip for row in rows) else "")
         + f"). PSNR in dB, peak = {peak_name(comparison)}; output and truth end at the peak. "
         + "Matched = after the one factor "
         + ("per window" if comparison.published else "per clip")

@@ -27,6 +27,7 @@ KEY = "domain"  # of the metadata of a weights file
 TIE = 0.05  # dB; differences of single clips scatter so that the mean of three has a standard error of 0.4 to 0.9
 NEAR = 1.25  # light and gain within this factor of the measured ones count as equal
 MAX_CELLS = 10_000
+UP_TO_A_FACTOR = "restored light is right up to a factor, as the published program learns grey / 255"
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,7 @@ class Scope:
 
     domain: Domain | None = None
     trained: tuple[Illumination, ...] = ()
+    relative: bool = False  # converted weights, see UP_TO_A_FACTOR
 
 
 def read_scope(path: Path, metadata: Mapping[str, str]) -> Scope:
@@ -152,7 +154,7 @@ def read_scope(path: Path, metadata: Mapping[str, str]) -> Scope:
         domain = None if text is None else Domain.from_json(text)
     except ValueError as error:
         raise ValueError(f"{path}: its domain is damaged ({error}); measure it again with `quiver domain`") from None
-    return Scope(domain, _trained(metadata.get("settings")))
+    return Scope(domain, _trained(metadata.get("settings")), bool(metadata.get("converted_from")))
 
 
 def _trained(text: str | None) -> tuple[Illumination, ...]:

@@ -10,7 +10,7 @@ from numpy import ndarray as Array
 
 from quiver.data.codes import DARKEST, Codes, light_of
 from quiver.data.illumination import Illumination
-from quiver.restoration.domain import NEAR, OperatingPoint, Scope, place_of
+from quiver.restoration.domain import NEAR, UP_TO_A_FACTOR, OperatingPoint, Scope, place_of
 from quiver.restoration.interface import RestoreOptions, Restorer
 
 DARK = 0.1  # dark counts over the events of the mean light, above which a stream is unlike all cells
@@ -81,8 +81,15 @@ def _dark_text(share: float) -> str:
 
 def remarks(methods: Iterable[Restorer], codes: Codes) -> list[str]:
     """Return the remarks on all networks among the methods."""
-    found = (None if m.scope is None else remark(m.name, m.scope, codes) or _run_unlike(m) for m in methods)
-    return [text for text in found if text is not None]
+    return [text for method in methods if (text := _remark(method, codes)) is not None]
+
+
+def _remark(method: Restorer, codes: Codes) -> str | None:
+    """Return the remark on a method; None for a classical one, and where there is nothing to say."""
+    if method.scope is None:
+        return None
+    text = remark(method.name, method.scope, codes) or _run_unlike(method)
+    return text if not method.scope.relative else f"{text or f'{method.name} was converted'}; {UP_TO_A_FACTOR}"
 
 
 def _run_unlike(method: Restorer) -> str | None:

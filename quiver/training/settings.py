@@ -150,12 +150,17 @@ def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}; the file is damaged, start again with --force") from None
     files = tuple(name for name in settings.sensors or () if name.endswith(".toml"))
-    if files and "noise" in found and set(mixture.noises) != set(noise):
+    if files and "noise" in found and _of_files(mixture.noises) != _of_files(noise):
         raise FileExistsError(
             f"{settings.out} holds a run with noise: {describe(noise)}; {', '.join(files)} now describes other noise; "
             "choose another -o, or start again with --force"
         )
     return told, Mixture(noise, "as this run began", mixture.streams).lines
+
+
+def _of_files(noises: tuple[Noise, ...]) -> set[tuple[str, str | None, str | None]]:
+    """Return what the sensor files among noises state; light and bits of a stored run may be those of other streams."""
+    return {(noise.sensor, noise.record, noise.defects) for noise in noises if noise.sensor.endswith(".toml")}
 
 
 def _as_tuple(value: Any) -> Any:

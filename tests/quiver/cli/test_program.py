@@ -308,7 +308,9 @@ def test_converted_weights_replace_weights_only(capsys, tmp_path):
         assert message in mistake(capsys, "convert-weights", source, "-o", output, "--force")
     assert {path: path.read_bytes() for path in held} == held
     words = ["convert-weights", theirs, "-o", tmp_path / "ours.safetensors"]
-    assert run(capsys, *words)[0] == 0
+    code, said, _ = run(capsys, *words)
+    assert code == 0
+    assert "restored light is right up to a factor" in said
     assert "exists" in mistake(capsys, *words)
     assert run(capsys, *words, "--force")[0] == 0
 

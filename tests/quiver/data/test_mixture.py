@@ -67,6 +67,9 @@ def test_two_sensors_among_the_streams_are_kept_apart(data, tmp_path):
     assert lines(data, tmp_path / "r", sensor="quiver-physical")[0].startswith(
         "noise: quiver-physical, 3 bits, 3.25 PPP (as"
     )
+    clips, two = open_clips(data), ["spad-320x240", "quiver-physical"]
+    assert set(choose(clips, two).noises) == set(choose(clips).noises)
+    assert len(choose(clips, two, bits=[1], ppp=[1.0]).noises) == 2  # the SPAD has its map
 
 
 def test_a_sensor_file_brings_its_bits_and_defects(tiny_dataset, tmp_path):

@@ -18,7 +18,7 @@ from quiver.data.noise import Noise, labels
 from quiver.model.unet import UNet, UNetConfig
 from quiver.restoration.restorers import restorer
 from quiver.training.loop import train
-from quiver.training.settings import Settings
+from quiver.training.settings import Settings, settled
 
 # Names in tables
 
@@ -101,6 +101,16 @@ def test_a_sensor_file_that_changed_is_another_run(tiny_dataset, tmp_path):
         FileExistsError, match=r"holds a run with noise: mine, 3 bits, 3\.25 PPP, PRNU 2 %; .*mine.toml"
     ):
         train(network(), small(tiny_dataset, tmp_path / "r", sensor=file), progress=False)
+
+
+def test_a_sensor_file_does_not_end_a_run_of_an_earlier_mixture(data, tmp_path):
+    """Earlier versions drew each of several sensors at the light of the streams of all."""
+    run = small(data, tmp_path / "r", sensor=("spad-320x240", sensor_file(tmp_path, QIS, 3)))
+    begun, _ = settled(run)
+    more = (*begun.noise, replace(begun.noise[-1], ppp=7.0))
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r/settings.json").write_text(json.dumps(replace(begun, noise=more).to_dict()))
+    assert settled(run)[0].noise == more
 
 
 def test_weights_tell_their_noise_without_folders(data, tmp_path):

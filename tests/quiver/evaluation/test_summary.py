@@ -154,3 +154,13 @@ def test_clips_of_several_devices_have_no_common_time():
     assert "(devices: cuda, not recorded; threads: 4, not recorded)" in summary.markdown(
         Comparison("data"), [net], [first, earlier[1]]
     )
+
+
+def test_clips_without_a_scene_are_told():
+    """Imported clips state none, so that each counts as a scene."""
+    net, score = method("net", lambda codes: codes), Score(20.0, 21.0, 0.5, 0.6, 1.0, 0.0, frames=3)
+    row = ComparisonRow("net", "", "3.25 PPP, 3 bit", "a", "a", score)
+    alone = summary.markdown(Comparison("data"), [net], [row, replace(row, clip="b", scene="b")])
+    assert "(clips of one scene averaged first; clips that state no scene count as one each)" in alone
+    known = [replace(row, scene="fan:0"), replace(row, clip="b", scene="fan:1")]
+    assert "state no scene" not in summary.markdown(Comparison("data"), [net], known)

@@ -7,8 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from clips import ClipMaker
 from domains import MEASURED, cell, run, stream, weights
+from golden import published_state
 
 import quiver
 from qsim.clip.sensing import Sensing, sense
@@ -20,10 +22,12 @@ from quiver.data.clips import open_clips
 from quiver.data.codes import Codes, array_codes, light_of
 from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise
-from quiver.model.weights import metadata_of
+from quiver.model.published_weights import convert_weights
+from quiver.model.weights import annotate, metadata_of
 from quiver.restoration import domain, domain_remarks
 from quiver.restoration.domain import Domain, Scope
 from quiver.restoration.interface import Restorer
+from quiver.restoration.restorers import restorer
 
 
 def test_inside_nothing_is_said_and_outside_the_better_method():
@@ -201,6 +205,21 @@ def test_a_sensor_whose_codes_tell_no_light_still_has_a_remark():
     with pytest.raises(ValueError, match="does not"):
         METHODS["moment"].restore(codes.read(0, 3), sensor, 5e-4)
     assert light_of(codes) > 0
+
+
+def test_converted_weights_have_light_up_to_a_factor(tmp_path):
+    """Also where they were measured to be best; weights that were trained here have light in photons."""
+    source, path = tmp_path / "their.pth", tmp_path / "small.safetensors"
+    torch.save(published_state(), source)
+    convert_weights(source, path)
+    clause = "restored light is right up to a factor, as the published program learns grey / 255"
+    (text,) = domain_remarks.remarks([restorer(str(path))], stream())
+    assert text.startswith("small was never measured against the classical methods")
+    assert text.endswith(f"; {clause}")
+    annotate(path, {domain.KEY: MEASURED.to_json()})
+    assert domain_remarks.remarks([restorer(str(path))], stream()) == [f"small was converted; {clause}"]
+    own = restorer(str(weights(tmp_path)))
+    assert "up to a factor" not in str(domain_remarks.remarks([own], stream()))
 
 
 def test_darkness_is_told_without_a_number():
