@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy import ndarray as Array
 
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
@@ -15,7 +16,7 @@ from qsim.scenes import common
 from qsim.scenes.common import any_angle, between, sign
 
 PITCH = 6e-6  # m
-KEYS, STEP = 12, 0.04  # poses of the path, s between two at speed 1
+KEYS, STEP = 12, 0.04  # poses of the path, s between two at speed 1; it is walked back and forth
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
@@ -74,13 +75,34 @@ def view(rng: np.random.Generator, speed: float) -> Camera:
     )
 
 
-def wandering(rng: np.random.Generator, speed: float) -> Keyframes:
+def wandering(rng: np.random.Generator, speed: float) -> BackAndForth:
     """Return a path through random poses, to the right and to the left in turn, at 0.5 to 1.2 m/s at speed 1."""
     side = sign(rng) * (-1.0) ** np.arange(KEYS)
     across = side * rng.uniform(0.01, 0.022, KEYS)
     places = np.column_stack([across, rng.normal(0, 0.004, KEYS), rng.normal(0, 0.008, KEYS)])
     turns = rng.normal(0, (0.02, 0.02, 0.04), (KEYS, 3))
-    times = STEP / speed * np.arange(KEYS)
-    return Keyframes(
-        tuple(times.tolist()), tuple(vector(place) for place in places), tuple(vector(turn) for turn in turns)
-    )
+    order = np.abs((np.arange(2 * KEYS + 1) + KEYS - 1) % (2 * KEYS - 2) - (KEYS - 1))  # 0 ... 11 ... 0, 1, 2
+    times = STEP / speed * np.arange(len(order))
+    path = Keyframes(tuple(times.tolist()), tuple(map(vector, places[order])), tuple(map(vector, turns[order])))
+    return BackAndForth(path)
+
+
+@dataclass(frozen=True)
+class BackAndForth(Motion):
+    """A path that never ends: to its last pose, back to the first, and again. Before time 0 it rests.
+
+    `path` leads there, back, and to the third pose again, so that its second pose is also the one before its last.
+    """
+
+    path: Keyframes
+
+    def pose(self, t: float) -> Array:
+        return self.path.pose(self._within(t))
+
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        return self.path.velocity(self._within(t))
+
+    def _within(self, t: float) -> float:
+        """Return a time [s] of the path with the pose of time t."""
+        first, last = self.path.times[1], self.path.times[-2]
+        return t if t <= last else first + (t - last) % (last - first)

@@ -38,6 +38,7 @@ from qsim.sensor.spad import BinarySPAD, PlaneByPlane
 from qsim.sensor.spike import SpikeCamera
 
 LAWS = ("table", "process", "planes", "closed form", "events", "spikes")  # of `Draw.law`
+UNEVEN = 0.01  # of the mean strength of a light, a difference that is stated
 _BLOCK_PIXELS = 1 << 22  # photons held in memory at a time while sensing: 32 MiB of float64
 
 
@@ -105,6 +106,17 @@ class Draw:
         """Return the number of codes in a clip: its frames over those of a code; late rows need the frames after it."""
         more = 0 if self.rows is None else self.rows.reach(*clip.shape[1:], clip.frame_rate)
         return (len(clip) - more) // self.planes
+
+    def about_flicker(self, clip: ClipFolder) -> str:
+        """Return how the light of a code differs from its truth, that of its middle clip frame; empty below UNEVEN."""
+        apart = 0.0  # of the mean strength of the light that differs most
+        for strengths in clip.strengths.values():
+            codes = strengths[: len(strengths) // self.planes * self.planes].reshape(-1, self.planes)
+            apart = max(apart, float(np.abs(codes.mean(axis=1) - codes[:, self.planes // 2]).max()))
+        if apart < UNEVEN:
+            return ""
+        what = "its truth has the light of its middle clip frame; render at the code rate with --shutter 1"
+        return f"; light flickers within a code, by up to {100 * apart:.3g} % of its mean: {what}"
 
     def frames(self, clip: ClipFolder, start: int, stop: int) -> Array:
         """Return codes [stop - start, H, W] of stream frames start ... stop - 1.

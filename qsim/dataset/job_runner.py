@@ -92,18 +92,20 @@ def render_seed(job: Job) -> int:
 def choose_budget(job: Job, scene: Scene) -> Budget:
     """Choose the budget for the wanted error and for the noise of the stream that collects most electrons per frame.
 
-    A code of several clip frames averages their errors, too. Streams in lux or with absolute light do not count: their
+    The noise of frames averages in a code that sums several. What repeats in all of them does not: its limit follows
+    from the stream that collects most electrons per code. Streams in lux or with absolute light do not count: their
     photons are known only after rendering.
     """
     from qsim.rendering import fidelity
     from qsim.sensor import devices
 
     settings = job.settings
-    electrons, ppp = 0.0, None
+    electrons, of_code, ppp = 0.0, 0.0, None
     for sensing in job.streams:
         if sensing.ppp is not None:
             sensor = devices.load(sensing.sensor, ppp=sensing.ppp, bits=sensing.bits, exposure=1 / settings.frame_rate)
             share, of_frame = sensor.efficiency, sensing.ppp / sensing.planes
+            of_code = max(of_code, of_frame * share * sensing.planes)
             if of_frame * share > electrons:
                 electrons, ppp = of_frame * share, of_frame
     return fidelity.choose_budget(
@@ -114,6 +116,7 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
         psnr=settings.psnr,
         ppp=ppp,
         quantum_efficiency=1.0 if ppp is None else electrons / ppp,
+        planes=1.0 if ppp is None else of_code / electrons,
         reuse=settings.reuse,
         seed=render_seed(job),
     )

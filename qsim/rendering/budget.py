@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy import ndarray as Array
@@ -67,7 +67,13 @@ class Allowed:
 
     white: float
     target: float  # of picture and truth clamped at white
-    sensor: float = math.inf  # without a clamp
+    sensor: float = math.inf  # without a clamp, of errors that are independent from frame to frame
+    planes: float = 1.0  # frames that a code sums
+
+    @property
+    def repeated(self) -> Allowed:
+        """The same for errors that repeat in all frames of a code, so that it does not average them."""
+        return replace(self, sensor=self.sensor / math.sqrt(self.planes), planes=1.0)
 
     def fraction(self, errors: Errors) -> float:
         """Return the fraction of the allowed error that these errors take; 1 is all of it."""
@@ -116,6 +122,16 @@ def light_windows(instants: Sequence[float], exposure: float) -> list[tuple[floa
         (start + exposure * (i // each) / count, start + exposure * (i // each + 1) / count)
         for i in range(len(instants))
     ]
+
+
+def as_bright(means: Array) -> Array:
+    """Return the means [3, 2, H, W] of `blur_left`, the middle one with the light of all in place of that of its part.
+
+    A middle instant without light is replaced by every third one. Pixels that are not finite do not count.
+    """
+    known = np.isfinite(means).all(axis=(0, 1))
+    every, middle = (float(np.sum(one, where=known)) for one in means[::2])
+    return np.stack([*means[:2], means[2] * (every / middle) if middle > 0 else means[1]])
 
 
 def blur_left(means: Array, count: int) -> float:

@@ -71,13 +71,16 @@ def choose_budget(
     psnr: float = 40.0,
     ppp: float | None = None,
     quantum_efficiency: float = 1.0,
+    planes: float = 1.0,
     denoise: bool | None = None,
     reuse: bool | None = None,
     seed: int = 0,
 ) -> Budget:
     """Return the smallest budget with an error below `psnr` [dB] and, at `ppp` photons, below the sensor's noise.
 
-    `ppp` is the highest light level at which the clip will be sensed; with None, only `psnr` counts. `denoise` None
+    `ppp` is the highest light level at which the clip will be sensed; with None, only `psnr` counts. A code that sums
+    `planes` frames of `ppp` photons each averages their noise. What repeats from frame to frame has a stricter limit,
+    that of a code: left-out bounces, and all errors of frames that are denoised or share samples. `denoise` None
     denoises if Open Image Denoise is installed and cheaper at the same measured error. `reuse` None lets neighbouring
     frames share samples where that is predicted to cost less and the trial costs little against the clip; True tries
     it at any length, False renders each frame alone. The result depends only on the arguments and the installed
@@ -91,6 +94,8 @@ def choose_budget(
             raise ValueError(f"{name}: expected True, False or None, got {wish!r}")
     if ppp is not None and not 0 < ppp < math.inf:
         raise ValueError(f"ppp: expected photons per pixel above 0, or None, got {ppp!r}")
+    if not 1 <= planes < math.inf:
+        raise ValueError(f"planes: expected frames in a code from 1 up, got {planes!r}")
     if not 0 < quantum_efficiency <= 1:
         raise ValueError(f"quantum_efficiency: expected a number above 0, at most 1, got {quantum_efficiency!r}")
     pilot = Pilot.of(scene, frame_rate, shutter, frames, seed)
@@ -102,13 +107,13 @@ def choose_budget(
     # Noise raises the percentile of few samples, so white comes from the pilot with the most samples. Blur lowers the
     # white of small bright things, so with an open shutter it comes from the blurred pilot.
     blurs = shutter > 0 and not rests(scene)
-    exposed = np.stack([pilot.blurred(t, PEAK_INSTANTS, DEEPEST).mean(axis=0) for t in pilot.times]) if blurs else full
-    rough, _ = allowed_in(exposed, psnr, ppp, quantum_efficiency)
-    bounces, cut, about_bounces = fewest_bounces(lambda depth: pilot.mean(COUNTS[1], depth), full, rough)
+    exposed = pilot.exposures(PEAK_INSTANTS, DEEPEST) if blurs else full
+    rough, _ = allowed_in(exposed, psnr, ppp, quantum_efficiency, planes)
+    bounces, cut, about_bounces = fewest_bounces(lambda depth: pilot.mean(COUNTS[1], depth), full, rough.repeated)
     left_out, dimmed = Errors.between(cut, full, rough.white), dimming(full, cut)
     halves = [pilot.halves(count, bounces) for count in COUNTS]
     bright = halves[-1].mean(axis=0)
-    allowed, limit = allowed_in(exposed if blurs else bright, psnr, ppp, quantum_efficiency)
+    allowed, limit = allowed_in(exposed if blurs else bright, psnr, ppp, quantum_efficiency, planes)
     why = "nothing moves" if shutter else "the shutter is 0"
     instants, blurred, about_blur = 1, 0.0, Finding("motion blur", "none, one instant", why)
     if blurs:
@@ -117,19 +122,20 @@ def choose_budget(
         instants, blurred, about_blur = fewest_instants(
             pilot.extent, contrast, lambda k: allowed.fraction(pilot.changes(k, bounces, allowed.white))
         )
-    share = math.sqrt(1 - min(allowed.fraction(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
+    strict = allowed.repeated
+    share = math.sqrt(1 - min(strict.fraction(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
     noise = Noise.of(halves, allowed.white).times(pilot.unevenness(instants))
     samples, about_samples = fewest_samples(noise, instants, allowed, share)
     fewer, about_denoiser = None, Finding("denoiser", "off", "not requested")
     if denoise is not False:
         fewer, about_denoiser = denoised_samples(
-            pilot, instants, bounces, allowed, share, samples, denoise, lambda n: noise.at(n / instants, instants)
+            pilot, instants, bounces, strict, share, samples, denoise, lambda n: noise.at(n / instants, instants)
         )
     alone = Sharing(samples, 0, "")
     if fewer is not None:
         alone = Sharing(fewer[0], 0, fewer[1])
         about_samples = Finding("samples", f"{fewer[0]} per pixel, denoised", f"without: {about_samples.chosen}")
-    need = Need(allowed, share, bounces, frames, alone, noise.at)
+    need = Need(strict, share, bounces, frames, alone, noise.at)
     chosen, about_reuse = shared_samples(pilot, need, denoise, reuse)
     if chosen is not alone:
         size = f"frames alone: {about_samples.chosen}"
@@ -142,20 +148,9 @@ def choose_budget(
     about_light, about_motion = _light(dimmed, noisy, bool(chosen.denoise)), moving(pilot.extent, shutter)
     shared = (limit, about_samples, about_denoiser, about_reuse)
     findings = (*shared, about_bounces, about_light, about_motion, about_blur, *lens)
-    return Budget(
-        chosen.samples,
-        bounces,
-        instants,
-        instants > 1,
-        bool(chosen.denoise),
-        left_out.plain,
-        left_out.at_white,
-        allowed.white,
-        *dimmed,
-        findings,
-        chosen.neighbours,
-        chosen.denoise or "high",
-    )
+    work = (chosen.samples, bounces, instants, instants > 1, bool(chosen.denoise))
+    errors = (left_out.plain, left_out.at_white, allowed.white, *dimmed)
+    return Budget(*work, *errors, findings, chosen.neighbours, chosen.denoise or "high")
 
 
 def shortfall(reached: Stated | None, asked: float) -> str:
@@ -169,7 +164,9 @@ def shortfall(reached: Stated | None, asked: float) -> str:
     return f"{reached.line}, where {asked:g} were requested: {why}"
 
 
-def allowed_in(image: Array, psnr: float, ppp: float | None, efficiency: float) -> tuple[Allowed, Finding]:
+def allowed_in(
+    image: Array, psnr: float, ppp: float | None, efficiency: float, planes: float
+) -> tuple[Allowed, Finding]:
     """Return the limits for a clip with the radiance of `image` (any shape, W m^-2 sr^-1), and the finding."""
     mean, white = float(image.mean()), white_in(image)
     target = white * 10 ** (-psnr / 20)
@@ -181,7 +178,8 @@ def allowed_in(image: Array, psnr: float, ppp: float | None, efficiency: float) 
     if ppp is not None:
         sensor = mean * math.sqrt(SENSOR_SHARE / (efficiency * ppp))
         text += f"; the sensor at {ppp:g} photons per pixel allows {sensor:.3g} without a clamp"
-    allowed = Allowed(white, target, sensor)
+        text += f", {sensor / math.sqrt(planes):.3g} of errors that repeat within a code" if planes > 1 else ""
+    allowed = Allowed(white, target, sensor, planes)
     return allowed, Finding("error", f"rms {min(target, sensor):.3g} W/m2/sr", text)
 
 

@@ -2,8 +2,9 @@
 
 Rays alone measure motion and bodies, in every frame or in MOST_LOOKS of them. Light is rendered in a few frames: the
 first, the middle and the last, those with bodies that these do not show, and, with an open shutter, those with the
-fastest motion. Under lights that flicker, frames of every strength take the place of the first three. Two independent
-half-renders separate Monte Carlo noise from signal. Equal frames use equal paths at every depth.
+fastest motion. Under lights that flicker, frames of every strength take the place of the first three; the brightest is
+added if they all miss its flash. Two independent half-renders separate Monte Carlo noise from signal. Equal frames use
+equal paths at every depth.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ FEWEST, RISE = 4, 1.25  # samples that are tried if COUNTS[0] leave room, and th
 PIXELS = 3000  # of the frame that a pilot renders, about
 MOST_MORE = 3  # frames added for hidden bodies, and as many for fast motion
 STRENGTHS = 6  # frames in which flickering light is rendered
+MOST_COUNTED = 32  # times that a dark frame counts beside a flash; more take memory
 WINDOW = 192  # px, side of the windows in which the denoiser is tested, one in the middle of each quarter of the frame
 MOST_LOOKS = 256  # frames of a clip in which motion and bodies are measured
 STAGE = 18  # of the random keys
@@ -45,6 +47,7 @@ class Pilot:
     extent: Array  # motion [frames, H, W] in px per exposure, or per frame time if the shutter is 0
     middle: int  # the frame in which the denoiser is tried: the middle one, or the brightest under flicker
     times: tuple[int, ...]  # frames in which light is rendered
+    counts: int | tuple[int, ...] = 1  # how often each of them counts
 
     @classmethod
     def of(cls, scene: Scene, frame_rate: float, shutter: float, frames: int, seed: int) -> Pilot:
@@ -53,7 +56,8 @@ class Pilot:
         renderer = Renderer(scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=Budget(), thinned=thinned)
         looks = np.unique(np.linspace(0, frames - 1, min(frames, MOST_LOOKS)).round().astype(int)).tolist()
         extent, bodies = (np.stack(each) for each in zip(*map(renderer.motion_extent, looks), strict=True))
-        middle, times = _lit(renderer, frames)
+        middle, counts = _lit(renderer, frames)
+        times = set(counts)
         known = set(np.unique([renderer.motion_extent(t)[1] for t in times]).tolist())
         for _ in range(MOST_MORE):
             hidden = ~np.isin(bodies, list(known))
@@ -65,15 +69,25 @@ class Pilot:
         if shutter > 0:
             times.add(looks[int(np.argmax([bright_end(frame) for frame in extent]))])
             times |= _fastest(scene, {t: renderer.time(t) for t in {*looks, *times}}, times)
-        return cls(renderer, extent, middle, tuple(sorted(times)))
+        ordered = tuple(sorted(times))
+        return cls(renderer, extent, middle, ordered, tuple(counts.get(t, 1) for t in ordered))
+
+    def counted(self, values: Array, axis: int = 0) -> Array:
+        """Return an array with the values of `times` along an axis, each as often as it counts."""
+        return np.repeat(values, self.counts, axis)
 
     def halves(self, samples: int, bounces: int) -> Array:
-        """Return two independent estimates of the sharp radiance, float64 [2, times, H, W], W m^-2 sr^-1."""
-        return np.stack([self._drawn(t, self.renderer.time(t), Budget(samples, bounces)) for t in self.times], axis=1)
+        """Return two independent estimates of the sharp radiance, float64 [2, counted times, H, W], W m^-2 sr^-1."""
+        drawn = [self._drawn(t, self.renderer.time(t), Budget(samples, bounces)) for t in self.times]
+        return self.counted(np.stack(drawn, axis=1), axis=1)
 
     def mean(self, samples: int, bounces: int) -> Array:
-        """Return the mean of the two halves, float64 [times, H, W], W m^-2 sr^-1."""
+        """Return the mean of the two halves, float64 [counted times, H, W], W m^-2 sr^-1."""
         return self.halves(samples, bounces).mean(axis=0)
+
+    def exposures(self, count: int, bounces: int) -> Array:
+        """Return the mean of each exposure over `count` instants, float64 [counted times, H, W], W m^-2 sr^-1."""
+        return self.counted(np.stack([self.blurred(t, count, bounces).mean(axis=0) for t in self.times]))
 
     def truths(self) -> list[dict[str, Array]]:
         """Return the ground truth of each frame in `times`, as `Renderer.truth`."""
@@ -86,12 +100,13 @@ class Pilot:
         contain the K instants, and all instants use the same paths, so that resting parts add nothing. The squared
         difference is the product over two independent halves, which has no bias from noise.
         """
-        squares = np.zeros((2, 2))
+        squares = []
         for t in self.times:
             means = [self.blurred(t, count * times, bounces) for times in (1, 3, 5)]
-            for i, (few, *more) in enumerate((np.minimum(means, white), means)):
-                squares[i] += [float(np.mean(np.prod(few - many, axis=0))) / len(self.times) for many in more]
-        return Errors(*np.sqrt(np.maximum(squares.max(axis=1), 0)).tolist())
+            both = (np.minimum(means, white), means)
+            squares.append([[np.mean(np.prod(few - many, axis=0)) for many in more] for few, *more in both])
+        largest = self.counted(np.array(squares)).mean(axis=0).max(axis=1)
+        return Errors(*np.sqrt(np.maximum(largest, 0)).tolist())
 
     def blurred(self, t: int, count: int, bounces: int) -> Array:
         """Return two estimates (float64 [2, H, W]) of frame t's mean over `count` instants, all with equal paths."""
@@ -119,17 +134,24 @@ class Pilot:
         return self.renderer.halves([instant], budget, self.renderer.key(t, STAGE))
 
 
-def _lit(renderer: Renderer, frames: int) -> tuple[int, set[int]]:
-    """Return the frame for the denoiser, and those in which light is rendered at least.
+def _lit(renderer: Renderer, frames: int) -> tuple[int, dict[int, int]]:
+    """Return the frame for the denoiser, and those in which light is rendered at least, with how often each counts.
 
     Under flicker they are STRENGTHS frames whose strengths are spread as those of the clip: first, middle and last may
-    all be dark. The strength of a frame is the sum over the lights.
+    all be dark. The strength of a frame is the sum over the lights. Where none of them has half of the largest
+    strength, the brightest frame joins them. The others then count more often, as in the clip: its mean decides white.
     """
     if not renderer.scene.flickers:
-        return frames // 2, {0, frames // 2, frames - 1}
+        return frames // 2, dict.fromkeys((0, frames // 2, frames - 1), 1)
     strengths = np.sum(list(renderer.strengths(frames).values()), axis=0)
     places = (np.arange(STRENGTHS) + 0.5) / STRENGTHS * frames
-    return int(np.argmax(strengths)), set(np.argsort(strengths, kind="stable")[places.astype(int)].tolist())
+    times = np.argsort(strengths, kind="stable")[places.astype(int)].tolist()
+    brightest, bright = int(np.argmax(strengths)), strengths >= strengths.max() / 2
+    if bright[times].any():
+        return brightest, dict.fromkeys(times, 1)
+    flashes = int(np.count_nonzero(bright))  # less than a twelfth of the frames
+    often = min(round((frames - flashes) / flashes / STRENGTHS), MOST_COUNTED)
+    return brightest, dict.fromkeys(times, often) | {brightest: 1}
 
 
 def rests(scene: Scene) -> bool:

@@ -7,8 +7,7 @@ Frame t is exposed around t / frame_rate: the mean of K instants, spread evenly 
 the shutter is 0 and in the sharp frame: motion is frozen there, light is not. Every pixel integrates its own area (box
 filter). Samples come in two independent halves A and B: radiance is their mean, and its noise the rms of (A - B) / 2.
 The stated error also contains blur and omitted bounces. The sampler's seeds are words of qsim.keys: frames can be
-rendered alone and in any order.
-Mitsuba's RGB variant renders scenes of three bands: their images are [3, H, W].
+rendered alone and in any order. Mitsuba's RGB variant renders scenes of three bands: their images are [3, H, W].
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.backend import RenderEngine
-from qsim.clip.clamped_error import Errors, frame_errors, rms, white_in
+from qsim.clip.clamped_error import Errors, error_at, frame_errors, rms, white_in
 from qsim.keys import Key, hash_name, words
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.rendering import ground_truth
-from qsim.rendering.budget import Budget, blur_left, grid_samples, instants, light_windows
+from qsim.rendering.budget import Budget, as_bright, blur_left, grid_samples, instants, light_windows
 from qsim.rendering.camera_rays import CameraRays, Film
 from qsim.rendering.denoiser import cleaned_mean
 from qsim.rendering.engine import activate, in_colour, select
@@ -50,7 +49,7 @@ class Frame:
     """One exposure with its error and ground truth."""
 
     radiance: Array  # float32 [H, W], or [3, H, W] of a colour scene, W m^-2 sr^-1, mean over the exposure
-    error: float  # rms error of `radiance`, W m^-2 sr^-1: noise and blur as measured, and the budget's `left_out`
+    error: float  # rms error of `radiance` or `sharp`, the larger, W m^-2 sr^-1: noise, blur, the budget's `left_out`
     errors_at: tuple[tuple[float, float], ...]  # (white, the same clamped there), rising; empty without light
     fireflies: int  # pixels whose halves differ by more than FIREFLY rms, or are not finite; those of `sharp` are added
     sharp: Array | None = None  # as radiance, the instant at mid-exposure, only for an open shutter
@@ -145,12 +144,12 @@ class Renderer:
         exposed = self._shared(t, self._whole) if self._whole else self._exposed(self.instants(t), self.key(t))
         radiance, error, errors_at, fireflies = exposed
         sharp = None
-        if self.shutter > 0 and self.budget.sharp:
-            sharp, _, _, more = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))
-            fireflies += more
+        if self.shutter > 0 and self.budget.sharp:  # the truth of scores: the larger error of both is stated
+            sharp, other, others_at, more = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))
+            error, fireflies = max(error, other), fireflies + more
+            errors_at = tuple((white, max(at, error_at(white, others_at or errors_at))) for white, at in errors_at)
         # Last: it leaves the scene at t + 1, where the next frame starts.
-        found = self.truth(t) if with_truth else {}
-        return Frame(radiance, error, errors_at, fireflies, sharp, **found)
+        return Frame(radiance, error, errors_at, fireflies, sharp, **(self.truth(t) if with_truth else {}))
 
     def window(self, crop: Crop) -> Renderer:
         """Return a renderer of the same loaded scene for every pixel of another crop."""
@@ -166,12 +165,15 @@ class Renderer:
     def halves(self, instants: list[float], budget: Budget, key: Key) -> Array:
         """Return independent estimates A, B of the mean radiance over the instants [s], float64 [2, H, W].
 
-        Those of a colour scene are [2, 3, H, W]; so are the radiances of all other functions here.
+        Those of a colour scene are [2, 3, H, W]; so are the radiances of all other functions here. A pixel that is not
+        finite in one of them is 0 in both, as in frames.
         """
-        return self.means(instants, budget, key)[0]
+        found = self.means(instants, budget, key)[0]
+        found[:, ~np.isfinite(found).all(axis=0)] = 0
+        return found
 
     def means(self, instants: list[float], budget: Budget, key: Key) -> Array:
-        """Return `halves` of all instants, of every third one, and of the middle one, float64 [3, 2, H, W].
+        """Return means of all instants, of every third one, and of the middle one, in halves, float64 [3, 2, H, W].
 
         The instants [s] are the middles of equal parts of an exposure; lights have their mean over `light_windows`.
         """
@@ -199,9 +201,8 @@ class Renderer:
                 sums[1] += drawn * 3 / n
             if i == n // 2:
                 sums[2] = drawn
-        if self.scene.flickers and n > 3:  # the middle one has the light of its part: as if it had that of all
-            sums[2] = sums[2] * (sums[0].mean() / sums[2].mean()) if sums[2].any() else sums[1]
-        return sums.reshape(*sums.shape[:-1], *self.shape)
+        means = sums.reshape(*sums.shape[:-1], *self.shape)
+        return as_bright(means) if self.scene.flickers and n > 3 else means
 
     def key(self, t: int, stage: int = RENDER_STAGE) -> Key:
         """Return the random key of frame t; seed, scene and stage select the samples."""
@@ -243,13 +244,13 @@ class Renderer:
             mixed = cleaned_mean(halves, *self.surfaces(instants, key), white, self.budget.quality)
             radiance, error = mixed.picture, mixed.error
 
-        def error_at(white: float) -> float:
+        def clamped(white: float) -> float:
             noise = mixed.error_at(white) if mixed else Errors.of_halves(halves, white).at_white
             blur = blur_left(np.minimum(means, white), len(instants)) if len(instants) > 1 else 0.0
             return math.hypot(noise, blur, self.budget.left_out_clamped)
 
         whole = math.hypot(error, blur_left(means, len(instants)), self.budget.left_out)
-        return radiance.astype(np.float32), whole, frame_errors(error_at, white), fireflies
+        return radiance.astype(np.float32), whole, frame_errors(clamped, white), fireflies
 
     def surfaces(self, instants: list[float], key: Key) -> tuple[Array, Array]:
         """Return albedo [H, W] or [3, H, W] (1 for mirrors and misses) and normals [H, W, 3], for the denoiser."""

@@ -15,8 +15,9 @@ from qsim import scenes
 from qsim.optics.camera import Camera
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
-from qsim.scene import AreaLamp, Body, Constant, EnvironmentImage, PointLight, Scene, SunSky, Translation
+from qsim.scene import AreaLamp, Body, Constant, EnvironmentImage, Keyframes, PointLight, Scene, SunSky, Translation
 from qsim.scene.shapes import sheet
+from qsim.scenes import macro
 from qsim.scenes.common import FRAME_RATE, HEIGHT, WIDTH
 
 SEEDS = (0, 1, 2)
@@ -169,6 +170,22 @@ def test_twice_the_speed_moves_as_far_in_half_the_time(family):
 @pytest.mark.parametrize(("family", "seed"), EVERY_SEED)
 def test_motion_at_speed_one_is_some_pixels_per_frame(family, seed):
     assert 0.8 < image_motion(built(family, seed)) < 8
+
+
+def test_the_camera_of_a_close_up_never_rests():
+    """At 40 times the speed its path of twelve poses lasts 22 frames: it goes back and forth, without a jump."""
+    camera = built("macro", 0, 40.0).camera
+    places = np.array([camera.pose(t / FRAME_RATE)[:3, 3] for t in range(200)])
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).min() > 1e-3  # m
+    motion, step = camera.motion, macro.STEP / 40
+    for turn in (11, 22, 23, 44, 45):
+        before, after = (motion.velocity((turn + side) * step)[0] for side in (-1e-6, 1e-6))
+        np.testing.assert_allclose(before, after, atol=0.01)  # m/s, of 20 to 50
+    np.testing.assert_allclose(motion.pose(7.3 * step), motion.pose((7.3 + 66) * step), atol=1e-9)
+    path = motion.path
+    earlier = Keyframes(*(values[: macro.KEYS] for values in (path.times, path.positions, path.turns)))
+    for t in np.linspace(-step, 10 * step, 50):
+        np.testing.assert_array_equal(motion.pose(t), earlier.pose(t))
 
 
 def test_loading_by_name_and_by_file(tmp_path):

@@ -138,6 +138,7 @@ class Trial:
             window = renderer.window(crop)
             budget = Budget(samples, need.bounces, neighbours=most)
             pictures = window.carrier(budget, need.frames, STAGE).pictures(t)
+            pictures[:, :, ~np.isfinite(pictures[0]).all(axis=0)] = 0  # as in frames
             noisy = Errors.of_halves(pictures[0], white).plain
             surfaces = window.surfaces([renderer.time(t)], renderer.key(t, STAGE)) if any(kinds) else None
             for kind in kinds:

@@ -67,6 +67,18 @@ def test_spikes_of_a_clip_follow_each_other(clip):
         np.testing.assert_array_equal(again, expected[t])
 
 
+@pytest.mark.parametrize(("bits", "stated"), [(1, False), (3, True)])
+def test_codes_whose_truth_has_other_light_say_so(tmp_path, bits, stated):
+    """An LED lights 5 frames of the first code of 7, its middle one too, and 2 frames of the second code."""
+    strength = np.repeat([2.0, 0.0], 7)
+    led = {"kind": "PulseWidth", "frequency": 1000.0, "strength": np.roll(strength, 2).tolist()}
+    clip = write_clip(tmp_path / "c", frames=14, height=7, width=9, flicker={"light0": led})
+    stream, line = sense(clip, Sensing(BinarySPAD(0.5, 200.0, bits), ppp=0.5 * (2**bits - 1), group=True, name="s"))
+    assert len(stream) == 14 // (2**bits - 1)
+    words = "light flickers within a code, by up to 57.1 % of its mean: its truth has the light of its middle clip"
+    assert (f"; {words} frame; render at the code rate with --shutter 1" in line) == stated
+
+
 def test_what_a_spike_camera_does_not_model_is_refused(clip, tmp_path):
     (tmp_path / "d.toml").write_text("[defects]\nprnu = 0.1\n")
     sensor = SpikeCamera(0.6, 100.0, 8)

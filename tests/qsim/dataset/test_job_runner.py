@@ -121,7 +121,10 @@ def failing(name: str, step: int, number: int, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_budget_hides_behind_the_noise_of_a_clip_frame(monkeypatch):
-    """A code of 7 planes or 12 slices averages the errors of its frames, so each frame has a share of its photons."""
+    """A code of 7 planes or 12 slices averages the noise of its frames, so each frame has a share of its photons.
+
+    What repeats in all frames of a code is compared with the electrons of the code.
+    """
     from qsim.rendering import fidelity
 
     asked = []
@@ -129,8 +132,16 @@ def test_the_budget_hides_behind_the_noise_of_a_clip_frame(monkeypatch):
     head = '[recipe]\nname = "t"\nframes = 12\nheight = 7\nwidth = 9\n[[scenes]]\nfamily = "fan"\n'
     summed = '[[streams]]\nsensor = "spad512s"\nbits = 3\ngroup = true\nppp = 14.0\n'
     sliced = '[[streams]]\nsensor = "quiver-physical"\nbits = 3\nslices = 12\nppp = 36.0\n'
-    for streams, ppp, efficiency in ((summed, 2.0, 0.5), (sliced, 3.0, 0.8), (summed + sliced, 3.0, 0.8)):
+    single = '[[streams]]\nsensor = "quiver-physical"\nbits = 3\nppp = 9.0\n'
+    for streams, ppp, efficiency, planes in (
+        (single, 9.0, 0.8, 1),
+        (summed, 2.0, 0.5, 7),
+        (sliced, 3.0, 0.8, 12),
+        (summed + sliced, 3.0, 0.8, 12),
+        (single + sliced, 9.0, 0.8, 4),  # 28.8 electrons per code, 7.2 per frame
+    ):
         (job,) = recipe.parse(head + streams).jobs
         job_runner.choose_budget(job, job_runner.load_scene(job))
         assert asked[-1]["ppp"] == pytest.approx(ppp)
         assert asked[-1]["quantum_efficiency"] == pytest.approx(efficiency)
+        assert asked[-1]["planes"] == pytest.approx(planes)

@@ -12,7 +12,7 @@ from small_scenes import CAMERA, plate, renderer, scene, square
 from qsim import colour
 from qsim.clip.clamped_error import Errors, Stated, error_at, white_in
 from qsim.rendering import fidelity
-from qsim.rendering.budget import Allowed, Budget, blur_error, explain
+from qsim.rendering.budget import Allowed, Budget, Finding, blur_error, explain
 from qsim.rendering.fidelity import Noise, choose_budget, shortfall
 from qsim.rendering.renderer import Renderer
 from qsim.scene import Body, Diffuse, Glow, PointLight, Scene, Spin, SunSky, Translation
@@ -40,6 +40,29 @@ def test_more_light_on_the_sensor_needs_more_samples():
     plain, bright = (choose_budget(made, psnr=25, ppp=ppp, denoise=False) for ppp in (None, 300.0))
     assert bright.samples > plain.samples
     assert "the sensor at 300 photons" in explain(bright.findings)
+
+
+def test_errors_that_repeat_in_all_frames_of_a_code_have_a_stricter_limit(monkeypatch):
+    """A code of 16 frames averages their noise: bounces, and frames that are denoised or shared, may err a quarter."""
+    made, limits = plate(Spin((0, 0, 1), 200.0), light=SunSky()), []
+
+    def denoised(*arguments):
+        limits.append(arguments[3])
+        return None, Finding("denoiser", "off", "")
+
+    def shared(_, need, *__):
+        limits.append(need.allowed)
+        return need.alone, Finding("reuse", "off", "")
+
+    monkeypatch.setattr(fidelity, "denoised_samples", denoised)
+    monkeypatch.setattr(fidelity, "shared_samples", shared)
+    single, several = (choose_budget(made, psnr=25, ppp=300, frames=2, planes=planes) for planes in (1, 16))
+    sensor = limits[0].sensor
+    assert [limit.sensor for limit in limits] == pytest.approx([sensor] * 2 + [sensor / 4] * 2, rel=0.02)
+    assert several.left_out <= fidelity.SHARE * limits[2].sensor
+    assert several.samples < 2 * single.samples  # not 16 times as many
+    assert "errors that repeat within a code" in explain(several.findings)
+    assert "errors that repeat within a code" not in explain(single.findings)
 
 
 def test_bounces_follow_the_scene():
@@ -185,6 +208,12 @@ def test_a_psnr_out_of_range_is_refused(psnr):
 def test_a_light_level_that_no_sensor_sees_is_refused(ppp):
     with pytest.raises(ValueError, match="ppp: expected photons per pixel above 0, or None"):
         choose_budget(plate(None), ppp=ppp)
+
+
+@pytest.mark.parametrize("planes", [0, 0.5, math.nan, math.inf])
+def test_a_code_without_frames_is_refused(planes):
+    with pytest.raises(ValueError, match="planes: expected frames in a code from 1 up"):
+        choose_budget(plate(None), ppp=3.0, planes=planes)
 
 
 @pytest.mark.parametrize("efficiency", [0.0, -0.5, 1.2, math.nan])

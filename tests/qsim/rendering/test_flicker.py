@@ -123,6 +123,19 @@ def test_a_lamp_that_is_dark_in_first_middle_and_last_frame_does_not_fool_the_bu
     assert clip.meta["flicker"]["light0"]["kind"] == "PulseWidth"
 
 
+def test_a_lamp_that_flashes_in_few_frames_gets_a_budget():
+    """At 2000 fps, an LED of 100 Hz lights 2 of 40 frames: its white is that of the clip, a mean of all frames."""
+    made = plate(None, Constant(0.7, PulseWidth(100.0, 0.02)))
+    loaded = Pilot.of(made, 2000.0, 0.0, 40, 0)
+    strengths = loaded.renderer.strengths(40)["light0"]
+    assert np.flatnonzero(strengths).tolist() == [0, 20]
+    assert strengths[list(loaded.times)].max() == strengths.max()
+    assert strengths[loaded.counted(np.array(loaded.times))].mean() == pytest.approx(strengths.mean(), rel=0.1)
+    steady = renderer(plate(None)).frame(0, with_truth=False).radiance.mean()
+    chosen = choose_budget(made, frames=40, psnr=25, denoise=False)
+    assert chosen.white == pytest.approx(2.5 * strengths.mean() * steady, rel=0.15)
+
+
 def test_the_budget_knows_that_flashes_spoil_the_average_of_instants():
     """Nine instants of which three have light average as little noise as three: 1.7 times that of nine."""
     loaded = Pilot.of(plate(None, Constant(0.7, PulseWidth(2000.0, 1 / 3, -np.pi))), 2000.0, 1.0, 5, 0)

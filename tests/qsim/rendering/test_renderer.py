@@ -14,10 +14,12 @@ from small_scenes import CAMERA, CHEAP, RATE, mirrored_sun, plate, renderer, sce
 from stats import assert_same_rms, critical_z
 
 from qsim.backend import choose
+from qsim.clip.clamped_error import error_at
 from qsim.optics.camera import Camera
 from qsim.rendering.budget import Budget, blur_error
 from qsim.rendering.denoiser import available
 from qsim.rendering.engine import select
+from qsim.rendering.fidelity import choose_budget
 from qsim.rendering.renderer import Renderer
 from qsim.scene import (
     AreaLamp,
@@ -27,6 +29,7 @@ from qsim.scene import (
     Glow,
     Oscillation,
     PointLight,
+    PulseWidth,
     Scene,
     Spin,
     Still,
@@ -211,6 +214,42 @@ def test_a_sharp_sample_that_is_not_a_number_is_counted(monkeypatch):
     frame = one.frame(0, with_truth=False)
     assert np.isfinite(frame.sharp).all()
     assert frame.fireflies == 1
+
+
+def test_a_sharp_frame_with_the_larger_error_states_the_error(monkeypatch):
+    """The sharp frame is the truth of scores: its halves are 1 +- 0.3, those of the exposure are equal."""
+    one = renderer(plate(None), shutter=1.0, budget=Budget(8, 2, 3))
+
+    def means(instants, *_):
+        apart = 0.3 if len(instants) == 1 else 0.0
+        return np.stack([np.stack([np.full(one.shape, 1 + apart), np.full(one.shape, 1 - apart)])] * 3)
+
+    monkeypatch.setattr(one, "means", means)
+    frame = one.frame(0, with_truth=False)
+    assert frame.error == pytest.approx(0.3)
+    assert error_at(1.0, frame.errors_at) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_pilot_and_a_flickering_exposure_tolerate_samples_that_are_not_numbers(monkeypatch, value):
+    """One pixel of every pass has no value: the budget and the error of an open shutter are those of the others."""
+    passed = Renderer._pass
+
+    def broken(self, *arguments):
+        found = passed(self, *arguments)
+        found[..., 0, 40] = value
+        return found
+
+    monkeypatch.setattr(Renderer, "_pass", broken)
+    flight, light = Translation((600.0, 0.0, 0.0)), Constant(0.7, PulseWidth(3000, 0.2))
+    frame = renderer(plate(flight, light), Budget(72, 2, 9), shutter=1.0).frame(0, with_truth=False)
+    assert math.isfinite(frame.error)
+    assert frame.error < frame.radiance.mean()
+    assert np.isfinite(frame.errors_at).all()
+    chosen = choose_budget(plate(None), psnr=25, frames=2, denoise=False)
+    errors = (chosen.left_out, chosen.left_out_at_white, chosen.dimmed, chosen.dimmed_error)
+    assert np.isfinite(errors).all()
+    assert 0 < chosen.white < math.inf
 
 
 def test_a_crop_shows_its_window_of_the_frame(spinning):

@@ -12,6 +12,7 @@ from qsim.clip.clamped_error import Errors, white_in
 from qsim.rendering.budget import Allowed
 from qsim.rendering.fidelity import choose_budget
 from qsim.rendering.pilot import Pilot
+from qsim.rendering.reuse.carrying import Carrier
 from qsim.rendering.reuse.sharing import (
     MOST_BYTES,
     NAME,
@@ -60,6 +61,20 @@ def test_a_clip_shares_samples_where_that_costs_less(turning):
     assert not found.denoise
     assert f"{found.neighbours} frames on each side" in about.chosen
     assert about.effect == NAME
+
+
+def test_a_sample_that_is_not_a_number_does_not_spoil_the_trial(turning, monkeypatch):
+    pilot, need = turning
+    carried = Carrier.pictures
+
+    def broken(self, t):
+        found = carried(self, t)
+        found[:, 0, 3, 4] = np.nan
+        return found
+
+    monkeypatch.setattr(Carrier, "pictures", broken)
+    found, _ = shared_samples(pilot, need, False, True)
+    assert found.neighbours in (1, 2, 3, 5)
 
 
 @pytest.mark.parametrize(
