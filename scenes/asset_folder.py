@@ -23,6 +23,7 @@ from qsim.scenes import common, tumble
 from qsim.scenes.common import any_angle, between, pick
 
 ENVIRONMENT_SUFFIXES = frozenset({".hdr", ".exr"})
+SUFFIXES = MESH_SUFFIXES | PICTURE_SUFFIXES | ENVIRONMENT_SUFFIXES
 
 
 def scene(seed: int = 0, *, speed: float = 1.0, folder: str | Path) -> Scene:
@@ -51,7 +52,7 @@ def assets(folder: str | Path) -> tuple[list[Path], list[Path], list[Path]]:
     kinds = (MESH_SUFFIXES, PICTURE_SUFFIXES, ENVIRONMENT_SUFFIXES)
     meshes, pictures, environments = ([p for p in found if p.suffix.lower() in kind] for kind in kinds)
     if not (meshes or pictures or environments):
-        known = ", ".join(sorted(MESH_SUFFIXES | PICTURE_SUFFIXES | ENVIRONMENT_SUFFIXES))
+        known = ", ".join(sorted(SUFFIXES))
         raise FileNotFoundError(f"{folder}: no mesh, picture or environment in this folder ({known})")
     return meshes, pictures, environments
 

@@ -125,30 +125,37 @@ class Dataset:
         return found
 
     def shared_between_splits(self) -> list[str]:
-        """Return one line per scene, mesh and texture of the test split that another split holds too.
+        """Return one line per scene, mesh, texture and file of the test split that another split holds too.
 
-        They are compared by content: a mesh by its vertices, a texture by its pixels or its file.
+        They are compared by content: a mesh by its vertices, a texture by its pixels or its file, a file by its bytes.
         """
         elsewhere: dict[str, str] = {}
         for name in self.names("train") + self.names("val"):
             elsewhere |= dict.fromkeys(_seen_in(self.path / "clips" / name), name)
         return [
-            f"{self.path / 'clips' / name}: its {asset} is also in {elsewhere[asset]}, which is not a test clip"
+            f"{self.path / 'clips' / name}: its {asset} is also in {elsewhere[key]}, which is not a test clip"
             for name in self.names("test")
-            for asset in _seen_in(self.path / "clips" / name)
-            if asset in elsewhere
+            for key, asset in _seen_in(self.path / "clips" / name).items()
+            if key in elsewhere
         ]
 
 
-def _seen_in(path: Path) -> list[str]:
-    """Return scene, meshes and textures of a clip; nothing if it cannot be read."""
+def _seen_in(path: Path) -> dict[str, str]:
+    """Return {what identifies it: its name} of scene, assets and read files of a clip; empty if it cannot be read."""
+    from qsim.scenes.asset_folder import SUFFIXES
+
     try:
         meta = Clip.open(path).meta
     except (ValueError, OSError):
-        return []
+        return {}
     scene = meta.get("scene") or {}  # an imported clip has none
     named = [f"scene {scene['family']}:{scene['seed']}"] if {"family", "seed"} <= scene.keys() else []
-    return [*named, *(meta.get("assets") or [])]
+    found = {asset.split(" ", 1)[-1]: asset for asset in [*named, *(meta.get("assets") or [])]}
+    reads = meta.get("reads")
+    for name, digest in reads.items() if isinstance(reads, dict) else ():
+        if "*" not in name and Path(name).suffix.lower() in {*SUFFIXES, ".serialized"}:  # a pattern has no content
+            found[str(digest)] = f"file {name} (SHA-256 {digest})"
+    return found
 
 
 def _read_record(path: Path) -> dict[str, Any]:

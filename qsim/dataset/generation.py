@@ -94,7 +94,8 @@ def generate(
                         raise OSError(errno.ENOSPC, result.message)
                     if result.state == "gone":
                         raise FileNotFoundError(result.message)
-                    if result.state == "done":
+                    # A worker may crash after it has written the record.
+                    if result.state == "done" or record_path(folder, result.name).is_file():
                         made.append(result.name)
                     else:
                         failed[result.name] = result.message
@@ -123,8 +124,8 @@ def _unproven(folder: Path, jobs: list[Job], made: list[str]) -> dict[str, str]:
             failed[name] = _ELSEWHERE
         elif problem := unproven(folder, by_name[name]):
             failed[name] = f"{_REPORTED}{problem}"
-            mark_failed(folder, by_name[name], failed[name])
             record_path(folder, name).unlink()
+            mark_failed(folder, by_name[name], failed[name])
     return failed
 
 
@@ -181,7 +182,7 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
     for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
     if not (folder / "dataset.json").is_file():
-        _check_records(recipe, folder)
+        _check_records(recipe, folder, repair)
         _check_reads(recipe, folder)
         write_manifest(recipe, folder)
         return ()
@@ -190,7 +191,7 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
     except Damaged as error:
         if not repair:
             raise
-        _check_records(recipe, folder)
+        _check_records(recipe, folder, repair)
         write_manifest(recipe, folder)
         return (str(error),)
     _check_reads(recipe, folder)
@@ -242,8 +243,11 @@ def _check_reads(recipe: Recipe, folder: Path) -> None:
                     )
 
 
-def _check_records(recipe: Recipe, folder: Path) -> None:
-    """`ValueError` if a folder without manifest has records, and none of them is of this recipe."""
+def _check_records(recipe: Recipe, folder: Path, repair: bool) -> None:
+    """`ValueError` if a folder without manifest has a record of a clip with other settings.
+
+    With `repair` such a clip is made again, and only a folder without any record of this recipe is refused.
+    """
     digests = {}
     for path in (folder / "jobs").glob("*.json"):
         with contextlib.suppress(ValueError):
@@ -253,6 +257,12 @@ def _check_records(recipe: Recipe, folder: Path) -> None:
         raise ValueError(_of_earlier_version(folder))
     if digests and not any(digests[job.name] == job.digest for job in asked):
         raise ValueError(f"{folder}: none of its {len(digests)} finished clips is of this recipe; use another folder")
+    other = [job.name for job in asked if isinstance(digests[job.name], str) and digests[job.name] != job.digest]
+    if other and not repair:
+        raise ValueError(
+            f"{folder}: its clip {other[0]} was made with other settings; use another folder, or --repair to make it "
+            "again"
+        )
 
 
 @contextlib.contextmanager
@@ -282,11 +292,13 @@ def _is_data_set(folder: Path) -> bool:
 
 
 def _failures(folder: Path, jobs: Sequence[Job]) -> dict[str, str]:
-    """Return why jobs failed before. A note that cannot be read counts as a failure, which --retry tries again."""
+    """Return why unfinished jobs failed before; an unreadable note counts. Delete the notes of finished jobs."""
     found = {}
     for job in jobs:
         path = failure_path(folder, job.name)
-        if path.is_file():
+        if record_path(folder, job.name).is_file():
+            path.unlink(missing_ok=True)
+        elif path.is_file():
             try:
                 found[job.name] = str(files.read_json(path).get("error", f"{path}: does not say why"))
             except ValueError as error:

@@ -164,7 +164,7 @@ def _check_streams(jobs: list[tuple[Job, Section]]) -> None:
     """`ValueError` with the line of [[scenes]] for clips whose streams could not be drawn after rendering."""
     seen = set()
     for job, section in jobs:
-        own = job.family != job.stem  # a scene of the user may state bands
+        own = job.family.endswith(".py")  # no other scene may state bands
         case = (job.settings, own)
         if case in seen:
             continue

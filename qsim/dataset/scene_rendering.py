@@ -103,6 +103,9 @@ def load_scene(
     frame_rate: float = 2000.0,
 ) -> tuple[Scene, dict[str, str]]:
     """Return a scene in its size, and the SHA-256 of each file that it reads; arguments and errors as of `render`."""
+    for name, side in (("height", height), ("width", width)):
+        if side is not None and not side >= 1:
+            raise ValueError(f"{name} must be a positive whole number of pixels, got {side!r}")
     if isinstance(scene, Scene):
         if speed is not None:
             raise ValueError(f"scene {scene.name}: a Scene has its motions already; leave speed= out")

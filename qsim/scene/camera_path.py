@@ -33,6 +33,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: y up, z back <-> y down, 
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # world: z up -> y up
 SKEW = 1e-3  # by which the axes of a pose may fail to be orthonormal; the nearest rotation is taken
 SQUARE = 1e-6  # relative difference of fl_x and fl_y
+SQUARE_BY_ANGLE = 1e-3  # the same of focal lengths from angles of view, which files state rounded
 MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "PERSPECTIVE")
 PLAIN = Camera(focal_length=1e-3, f_number=2.8, pixel_pitch=1.1e-6, height=1, width=1)  # its size does not count
 ZERO = ("k3", "k4", "p1", "p2")  # terms of lenses that are not modelled
@@ -211,11 +212,13 @@ def _seen_from(found: dict[str, Any], where: str, like: Camera, pose: Array, siz
     if "fl_x" not in stated and "camera_angle_x" not in stated:
         raise ValueError(f"{where}: states neither fl_x nor camera_angle_x; one of them gives the view")
     focal = stated.get("fl_x") or width / 2 / math.tan(stated["camera_angle_x"] / 2)
-    other = stated.get("fl_y", focal)
-    if abs(other / focal - 1) > SQUARE:
+    other, allowed = stated.get("fl_y", focal), SQUARE
+    if "fl_y" not in stated and {"w", "h", "camera_angle_y"} <= stated.keys():  # without a size, `like` has another
+        other, allowed = height / 2 / math.tan(stated["camera_angle_y"] / 2), SQUARE_BY_ANGLE
+    if abs(other / focal - 1) > allowed:
         raise ValueError(
-            f"{where}: fl_x is {focal:g} and fl_y {other:g}: pixels are square here; calibrate with one focal length "
-            "(COLMAP's model RADIAL), or resample the pictures"
+            f"{where}: its focal length is {focal:g} px along x and {other:g} px along y: pixels are square here; "
+            "calibrate with one focal length (COLMAP's model RADIAL), or resample the pictures"
         )
     shift = ((stated.get("cx", width / 2) - width / 2) / height, (stated.get("cy", height / 2) - height / 2) / height)
     bent = Lens(stated.get("k1", 0.0), stated.get("k2", 0.0), () if like.lens is None else like.lens.falloff, shift)

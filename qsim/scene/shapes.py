@@ -223,8 +223,11 @@ def mesh_file(path: str | Path, size: float | None = None) -> Mesh:
     if len(vertices) == 0 or len(loaded.faces) == 0:
         raise ValueError(f"mesh {path}: it contains no triangles")
     low, high = vertices.min(0), vertices.max(0)
-    scale = 1.0 if size is None else size / float((high - low).max())
-    return box_mapped((vertices - (low + high) / 2) * scale, loaded.faces, size or float((high - low).max()))
+    longest = float((high - low).max())
+    if longest == 0:
+        raise ValueError(f"mesh {path}: all its vertices lie in one point")
+    scale = 1.0 if size is None else size / longest
+    return box_mapped((vertices - (low + high) / 2) * scale, loaded.faces, size or longest)
 
 
 def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:

@@ -87,3 +87,21 @@ def test_what_training_sees_of_the_test_split_is_reported(tmp_path: Path, asset:
     assert len(shared) == 1
     assert f"its {asset} is also in fan_0001, which is not a test clip" in shared[0]
     assert shared[0] in Dataset.open(tmp_path / "d").verify()
+
+
+def test_files_that_scenes_of_both_kinds_read_are_reported_by_name(tmp_path: Path):
+    """A mesh of a folder has another size in every body, and an XML scene has no bodies: their files were not compared.
+
+    A pattern's digest covers names alone, and text is not an asset. A picture that is a photograph too is named once.
+    """
+    folder = tmp_path / "d"
+    generate(SMALL, folder, HERE, make=make)
+    for name, mesh, picture in [("fan_0001", "bunny.obj", "a.png"), ("tumble_0004", "/mine/HARE.OBJ", "b.png")]:
+        path = folder / "clips" / name / "clip.json"
+        reads = {mesh: "1f", picture: "2f", "*.obj": "3f", "LICENCE.txt": "4f", f"{name}.hdr": name}
+        files.write_description(path, files.read_json(path) | {"assets": ["photograph 2f"], "reads": reads})
+    shared = generate(SMALL, folder, HERE, make=make).shared
+    clip = folder / "clips" / "tumble_0004"
+    named = ("b.png (SHA-256 2f)", "/mine/HARE.OBJ (SHA-256 1f)")
+    assert shared == tuple(f"{clip}: its file {each} is also in fan_0001, which is not a test clip" for each in named)
+    assert set(shared) <= set(Dataset.open(folder).verify())

@@ -113,6 +113,23 @@ def test_a_note_of_failure_that_cannot_be_read_stops_nothing(tmp_path: Path, und
     assert tree(folder) == undisturbed
 
 
+def test_a_job_whose_worker_crashed_after_its_record_is_done(tmp_path: Path, undisturbed: dict[str, bytes]):
+    """Its note of failure stayed for ever, because --retry runs no job that has a record."""
+    folder, why = tmp_path / "d", "its worker process crashed 2 times"
+
+    def run(chosen, place, maker):
+        for job in chosen:
+            job_runner.run_job(job, place, maker)
+            job_runner.mark_failed(place, job, why)
+            yield job_runner.Result(job.name, "crashed", why)
+
+    assert generate(SMALL, folder, HERE, make=make, run=run) == Summary(3, 3, 3, {}, ())
+    job_runner.mark_failed(folder, SMALL.jobs[0], why)
+    assert generate(SMALL, folder, HERE, make=make) == Summary(3, 3, 0, {}, ())
+    assert list((folder / "failed").iterdir()) == []
+    assert tree(folder) == undisturbed
+
+
 def test_clips_that_were_made_somewhere_else_are_named(tmp_path: Path):
     """Workers with another folder of that name report "done" in good faith."""
     generate(SMALL, tmp_path / "there", HERE, make=make)
@@ -171,6 +188,22 @@ def test_another_recipe_in_the_same_folder_is_refused(tmp_path: Path):
     (other / "thesis.tex").touch()
     with pytest.raises(ValueError, match="is not empty and not a data set"):
         generate(SMALL, other, HERE, make=make)
+
+
+def test_an_edited_recipe_is_refused_after_its_manifest_was_lost(tmp_path: Path, undisturbed: dict[str, bytes]):
+    """Clips of the old settings were listed as done with the digests of the new ones; --repair makes them again."""
+    folder = tmp_path / "d"
+    generate(SMALL, folder, HERE, make=make)
+    edited = recipe.parse(RECIPE.replace("frames = 2", "frames = 2\npsnr = 30"))
+    (folder / "dataset.json").unlink()
+    with pytest.raises(ValueError, match="clip tumble_0004 was made with other settings; use another folder, or --"):
+        generate(edited, folder, HERE, make=make)
+    assert not (folder / "dataset.json").exists()
+    assert generate(SMALL, folder, HERE, make=make) == Summary(3, 3, 0, {}, ())
+    assert tree(folder) == undisturbed
+    (folder / "dataset.json").unlink()
+    assert generate(edited, folder, Options(workers=0, repair=True), make=make).made == 1
+    assert Dataset.open(folder).verify() == []
 
 
 def test_a_folder_of_somebody_else_is_still_refused(tmp_path: Path):

@@ -231,6 +231,21 @@ def test_streams_that_could_not_be_drawn_fail_before_rendering(tmp_path, render,
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("family", ["./things", "room.xml"])
+def test_colour_streams_of_scenes_that_cannot_state_bands_fail_before_rendering(tmp_path: Path, family: str):
+    """Every clip was rendered, and then its job failed; only a .py scene may state bands."""
+    (tmp_path / "things").mkdir()
+    (tmp_path / "room.xml").touch()
+    (tmp_path / "own.py").touch()
+    stream = '[[streams]]\nsensor = "quiver-physical"\nppp = 3.0\ncolour = "rggb"\n'
+    path = tmp_path / "r.toml"
+    path.write_text(f'{HEAD}[[scenes]]\nfamily = "{family}"\n{stream}')
+    with pytest.raises(ValueError, match="has one band, and the sensor has colour filters"):
+        recipe.load(path)
+    path.write_text(f'{HEAD}[[scenes]]\nfamily = "own.py"\n{stream}')
+    assert recipe.load(path).jobs
+
+
 @pytest.mark.parametrize("unit", ["ppp = 3.0", "lux = 3.0", "absolute = true"])
 def test_streams_are_checked_without_their_light(unit):
     """A recipe with every unit of light is accepted."""
@@ -239,8 +254,8 @@ def test_streams_are_checked_without_their_light(unit):
 
 
 def test_a_sensor_whose_name_holds_a_dot_keeps_it():
-    stream = '[[streams]]\nsensor = "cmos-5.1e"\nbits = 3\nppp = 3.25\n'
-    assert parse(HEAD + SCENES + stream).jobs[0].streams[0].stream_name == "cmos-5.1e_3bit_3.25ppp"
+    stream = '[[streams]]\nsensor = "cmos-5.1e"\nbits = 10\nppp = 3.25\n'
+    assert parse(HEAD + SCENES + stream).jobs[0].streams[0].stream_name == "cmos-5.1e_10bit_3.25ppp"
 
 
 def test_splits_are_by_scene_whatever_the_speed():

@@ -20,6 +20,7 @@ from qsim.scene.camera_path import read_camera_path, write_camera_path
 
 CAMERA = Camera(2e-3, 2.8, 3e-6, 48, 65, origin=(0.3, 1.0, 2.0))
 LEVEL = [[1.0, 0, 0, 0], [0, 0, -1, -2], [0, 1, 0, 0], [0, 0, 0, 1]]  # two metres before the z axis, z up, along +y
+ANGLES = {"fl_x": None, "fl_y": None, "w": 640, "h": 480}  # a view that is stated by angles alone
 
 
 def written(path: Path, **changes: Any) -> Path:
@@ -110,6 +111,15 @@ def test_what_files_of_other_programs_state_is_read(tmp_path: Path):
     assert read_camera_path(slow, frame_rate=5.0).pose(0.2)[0, 3] == pytest.approx(1)
 
 
+def test_rounded_angles_of_square_pixels_are_read(tmp_path: Path):
+    """The vertical angle was not read; without a size it belongs to pictures of another shape, and is not compared."""
+    angles = {"camera_angle_x": 0.8, "camera_angle_y": round(2 * math.atan(0.75 * math.tan(0.4)), 3)}
+    camera = read_camera_path(written(tmp_path / "a.json", **ANGLES, **angles))
+    assert camera.focal_pixels == pytest.approx(320 / math.tan(0.4))
+    unsized = read_camera_path(written(tmp_path / "b.json", **ANGLES | {"w": None, "h": None}, **angles), CAMERA)
+    assert unsized.focal_pixels == pytest.approx(32.5 / math.tan(0.4))
+
+
 def test_a_thin_lens_keeps_its_focus_and_gets_the_view(tmp_path: Path):
     like = replace(CAMERA, aperture_blur=True, focus_distance=0.05, f_number=1.4, lens=Lens(falloff=(-0.2,)))
     camera = read_camera_path(written(tmp_path / "p.json", k1=0.01), like)
@@ -133,6 +143,10 @@ def test_a_thin_lens_keeps_its_focus_and_gets_the_view(tmp_path: Path):
         ({"p1": 1e-3}, "p1 is 0.001; only k1 and k2 are modelled here"),
         ({"k3": 0.1, "p2": 0.2}, "calibrate without k3, p2"),
         ({"fl_y": 501.0}, "pixels are square here"),
+        (
+            ANGLES | {"camera_angle_x": 0.8, "camera_angle_y": 0.8},
+            "756.* px along x and 567.* px along y: pixels are sq",
+        ),
         ({"fl_x": None}, "states neither fl_x nor camera_angle_x"),
         ({"w": None}, "states no w and h"),
         ({"frame_rate": None}, "states no frame_rate"),

@@ -216,3 +216,12 @@ def test_mesh_files_are_centred_and_scaled(tmp_path):
     (tmp_path / "broken.ply").write_bytes(b"not a mesh")
     with pytest.raises(ValueError, match=r"broken.ply: not readable"):
         mesh_file(tmp_path / "broken.ply")
+
+
+@pytest.mark.parametrize("size", [None, 0.2])
+def test_a_mesh_file_of_one_point_is_refused(tmp_path, size):
+    """A folder with such a mesh ended in a ZeroDivisionError."""
+    path = tmp_path / "point.obj"
+    path.write_text("v 1 2 3\nv 1 2 3\nv 1 2 3\nf 1 2 3\n")
+    with pytest.raises(ValueError, match=r"mesh .*point\.obj: all its vertices lie in one point"):
+        mesh_file(path, size)
