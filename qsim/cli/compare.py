@@ -36,7 +36,7 @@ def _run_compare(args: argparse.Namespace) -> int:
     found = readouts.compare(Clip.open(args.clip), args.streams or (), args.span)
     lines = text_table([_cells(row) for row in found.rows], _HEADER, left=2)
     head = f"{found.clip}: {len(found.instants)} instants, {found.span * 1e3:.4g} ms each, against the sharp light"
-    output(args, asdict(found), [head, *lines])
+    output(args, asdict(found), [head, *lines, *found.remarks])
     return 0
 
 

@@ -150,7 +150,7 @@ def add_report(sub: Any) -> None:
 def _run_report(args: argparse.Namespace) -> int:
     from qsim.report import report
 
-    only = args.paths[0].resolve().stem if len(args.paths) == 1 else ""
+    only = _name_of(args.paths[0]) if len(args.paths) == 1 else ""
     target = _page_target(args, f"{only or 'report'}.html")
     with bar("drawing", "thing") as progress:
         page = report.build_page(*args.paths, title=args.title, notes=args.note, progress=progress)
@@ -175,8 +175,14 @@ def _run_explore(args: argparse.Namespace) -> int:
 
     if (args.path / "dataset.json").is_file():
         raise ValueError(f"{args.path}: is a data set; name one of its clips, as in {args.path / 'clips'}/NAME")
-    target = _page_target(args, f"{args.path.resolve().stem}_explore.html")
+    target = _page_target(args, f"{_name_of(args.path)}_explore.html")
     return _write_page(args, target, explore_page(Clip.open(args.path)))
+
+
+def _name_of(path: Path) -> str:
+    """Return the name of a folder, which may hold dots, or of a file without its ending."""
+    path = path.resolve()
+    return path.name if path.is_dir() else path.stem
 
 
 def _page_target(args: argparse.Namespace, default: str) -> Path:

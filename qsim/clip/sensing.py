@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy import ndarray as Array
 
 from qsim import checks, files, keys, locks
@@ -53,6 +54,12 @@ class Sensing:
     colour: str | ColourFilter | None = None  # rggb, quad, rgbw or .toml with a table [colour]; None: as for defects
     exposures: tuple[float, ...] | None = None  # shares of a code's time, in turn; None: all of it
     follow: bool = False  # counting SPAD: draw photon by photon, even where the closed form is exact
+
+    def __post_init__(self) -> None:
+        """Replace numbers of NumPy, which JSON cannot hold, by those of Python."""
+        for name, value in list(vars(self).items()):
+            if isinstance(value, np.generic):
+                object.__setattr__(self, name, value.item())
 
     @property
     def stream_name(self) -> str:
@@ -257,6 +264,7 @@ def sense(
         line += f"; {draw.rows}"
     if draw.shares is not None:
         line += f"; {gates.words(draw.shares)}"
+    line += draw.about_flicker(clip)
     if draw.defects is not None:
         effects = [key for key, value in draw.defects.to_dict().items() if value and key != "device_seed"]
         line += f"; defects: {', '.join(effects) or 'none'}"

@@ -19,7 +19,9 @@ from qsim.clip.photons import clip_photons
 from qsim.clip.stream import Stream
 from qsim.colour import bright_end
 from qsim.report import html as page
+from qsim.sensor.defects import good_pixels
 from qsim.sensor.demosaicing import demosaic, determines_bands
+from qsim.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -85,7 +87,8 @@ def score(light: Photons, truth: Photons | None) -> str:
 def stream_panels(stream: Stream, frames: range, truth: Photons | None = None) -> list[page.Panel]:
     """Return panels of the codes, and of the naive mean of up to 11 frames around each, on the tone curve of the truth.
 
-    `truth` is the light of these frames [photons]; with it, each panel states its PSNR.
+    `truth` is the light of these frames [photons]; with it, each panel states its PSNR. Captions name the defects that
+    are left in the light.
     """
     reach = colour.AVERAGE // 2
     first, last = max(frames.start - reach, 0), min(frames.stop + reach, len(stream))
@@ -93,7 +96,8 @@ def stream_panels(stream: Stream, frames: range, truth: Photons | None = None) -
     averages = np.stack([codes[max(t - reach - first, 0) : t + reach + 1 - first].mean(axis=0) for t in frames])
     shown = codes[frames.start - first : frames.stop - first]
     names = f"codes, {stream.bits} bit ({stream.name})", f"mean of {colour.AVERAGE} frames"
-    one, many = _inverse(stream, 1), _inverse(stream, min(colour.AVERAGE, len(stream)))
+    sensor, left = good_pixels.of_stream(stream.sensor, stream.meta)
+    one, many = (_inverse(stream, sensor, samples) for samples in (1, min(colour.AVERAGE, len(stream))))
     if one is None or many is None:
         shown_codes = colour.code_levels(shown, stream.bits)
         return [
@@ -110,22 +114,23 @@ def stream_panels(stream: Stream, frames: range, truth: Photons | None = None) -
         else:  # one filter over all pixels: what it lets pass, in grey
             truth = mosaic
     white = colour.peak(picture if truth is None else truth)
+    after = f"; {left}" if left else ""
     brightest = float(one(np.array([2.0**stream.bits - 1]))[0])
     return [
-        page.Panel(names[0], fit(colour.tone(light, min(white, brightest))), score(light, mosaic)),
-        page.Panel(names[1], fit(toned(picture, white)), score(picture, truth)),
+        page.Panel(names[0] + after, fit(colour.tone(light, min(white, brightest))), score(light, mosaic)),
+        page.Panel(names[1] + after, fit(toned(picture, white)), score(picture, truth)),
     ]
 
 
-def _inverse(stream: Stream, samples: int) -> Callable[[NDArray[np.number]], Photons] | None:
-    """Return a function, means of this many codes [...] -> light [photons].
+def _inverse(stream: Stream, sensor: Sensor, samples: int) -> Callable[[NDArray[np.number]], Photons] | None:
+    """Return a function, means of this many codes [...] of a sensor -> light [photons].
 
     None for a sensor of more than _BITS bits or whose mean code does not rise, and for codes of different exposures.
     """
     if stream.bits > _BITS or stream.shares is not None:
         return None
     try:
-        response = stream.sensor.response(stream.exposure)
+        response = sensor.response(stream.exposure)
         response.cap(samples)
     except ValueError:
         return None

@@ -31,6 +31,7 @@ _HEADINGS = {  # of keys whose words alone are unclear
     "frame_rate": "planes/s",
     "motion_px_per_code_frame": "motion [px per 3-bit frame]",
     "blur_error": "blur [photons rms]",
+    "blur_over_peak": "blur [of the peak]",
     "blur_predicted": "blur expected [photons rms]",
     "shot_error": "photon noise [photons rms]",
     "quantisation_error": "quantization [photons rms]",
@@ -218,7 +219,7 @@ def study_section(path: Path) -> page.Section:
     found = files.read_json(path)
     rows = found.get("rows") or found.get("cells") or []
     if path.stem.startswith("figure"):
-        rows = [{"clip": row["clip"]} | panel for row in rows for panel in row["panels"]]
+        rows = [{"clip": row["clip"]} | _panel_row(panel) for row in rows for panel in row["panels"]]
     words = {key: value for key, value in found.items() if isinstance(value, int | float | str)}
     keys = list(dict.fromkeys(key for row in rows for key in row if not isinstance(row[key], list | dict)))
     table = page.table(page.Table(f"{len(rows)} rows", [_heading(key) for key in keys],
@@ -229,6 +230,11 @@ def study_section(path: Path) -> page.Section:
     figure = page.stored_figure(picture.read_bytes(), name) if picture.is_file() else None
     story = next((str(text) for text in (found.get("answer"), *found.get("answers", [])) if text), "")
     return page.section(f"Study: {path.parent.name}", page.bullets(lines), figure, table, story=story)
+
+
+def _panel_row(panel: dict[str, Any]) -> dict[str, Any]:
+    """Return a panel of a figure; earlier versions stored its blur, a share of the peak, as `blur_error`."""
+    return {"blur_over_peak" if key == "blur_error" else key: value for key, value in panel.items()}
 
 
 def bench_section(path: Path) -> page.Section:

@@ -80,6 +80,13 @@ def _gain(name: str, ppp: float, bits: int) -> float:
     return 0.5 * (2**bits - 1) / ppp
 
 
+def _cmos(bits: int) -> QIS:
+    """Return a conventional pixel of 5.1 e- read noise; `ValueError` for codes that end near its black."""
+    if bits < 8:
+        raise ValueError("cmos-5.1e: black is at code 32; give 8 bits or more")
+    return QIS(_QUIVER_QE, _QUIVER_DARK, 5.1, bits, gain=1.0, offset=32.0)
+
+
 @dataclass(frozen=True)
 class Device:
     """One named sensor: the function that makes it, and the source of each number."""
@@ -141,7 +148,7 @@ DEVICES: Mapping[str, Device] = MappingProxyType(
                 "cmos-5.1e",
                 "conventional CMOS pixel for comparison, 10 to 12 bits",
                 10,
-                lambda ppp, bits, exposure: QIS(_QUIVER_QE, _QUIVER_DARK, 5.1, bits, gain=1.0, offset=32.0),
+                lambda ppp, bits, exposure: _cmos(bits),
                 {
                     "read_noise": "5.1 e- rms; QUIVER paper, figure 1",
                     "quantum_efficiency": "0.8; set equal to the QIS, so that a comparison shows the read noise alone",

@@ -4,7 +4,8 @@
 
 A stream of short codes averages many of them, one of long codes few, and all see the same motion. Light is compared in
 the clip's own unit, so streams at other light levels are compared, too. A first row states the error of the light
-itself: the mean of the span without noise, which is what blur leaves.
+itself: the mean of the span without noise, which is what blur leaves. Of a stream with defects the response is that of
+its good pixels; remarks name what it leaves out.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from qsim.clip.photons import clip_photons
 from qsim.clip.stream import Stream
 from qsim.colour import psnr
 from qsim.optics.radiometry import WHITE_PER_MEAN
+from qsim.sensor.defects import good_pixels
 from qsim.sensor.estimation import Response
 
 _POINTS = 1024  # of a response: interpolation errs by less than 2e-5 of the full scale, and 12 bits take seconds
@@ -48,6 +50,7 @@ class Readouts:
     span: float  # s, as asked
     instants: tuple[int, ...]  # clip frames that were compared
     rows: tuple[ReadoutRow, ...]
+    remarks: tuple[str, ...] = ()  # defects of streams that estimates do not invert
 
 
 def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) -> Readouts:
@@ -82,12 +85,15 @@ def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) ->
 
     blurred = np.stack([_light(clip, t - window // 2, window) for t in centres])
     rows = [ReadoutRow("", "light", None, window, window * frame, None, score(blurred), None)]
+    remarks: list[str] = []
     for stream in streams:
         codes = max(1, round(window / _frames_per_code(stream)))
-        response = stream.sensor.response(stream.exposure, _POINTS)
+        sensor, left = good_pixels.of_stream(stream.sensor, stream.meta)
+        remarks += [f"{stream.name}: {left}"] if left else []
+        response = sensor.response(stream.exposure, _POINTS)
         found = np.stack([_estimate(stream, response, t, codes) for t in centres])
         rows.append(_row(stream, codes, codes * _frames_per_code(stream) * frame, score(found)))
-    return Readouts(clip.name, seconds, centres, tuple(rows))
+    return Readouts(clip.name, seconds, centres, tuple(rows), tuple(remarks))
 
 
 def _frames_per_code(stream: Stream) -> int:

@@ -16,7 +16,6 @@ from qsim.clip.sensing import Sensing, describe, sense, write_stream
 from qsim.clip.simulation import Draw
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
-from qsim.sensor.defects import defect_table
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.clip_study import check_clip
 from qsim.studies.bit_depth.readout import StudySettings, at_depth, plane_sensor, readouts
@@ -137,11 +136,10 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings, *, force: b
     for bits in settings.bits:
         m = 2**bits - 1
         path = stream_clip(clip, folder, bits, force)
-        grouped = group(clip, path, m, force=force)
         read = Sensing(settings.sensor, bits, ppp=m * level.ppp, seed=settings.seed, name="multibit")
         if settings.sensor.endswith(".toml"):  # read at every depth, which the file does not state
-            own = at_depth(settings.sensor, bits, m * level.ppp, m * clip.exposure)
-            read = replace(read, sensor=own, defects=defect_table.from_toml(settings.sensor))
+            read = replace(read, sensor=at_depth(settings.sensor, bits, m * level.ppp, m * clip.exposure))
+        grouped = group(clip, path, m, force=force)
         sense(grouped, read)
         key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
         draw = Draw(replace(plane, bits=bits), plane, level, key, m, False)

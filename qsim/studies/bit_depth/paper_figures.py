@@ -70,7 +70,7 @@ def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
             "motion_px_per_frame": None if speed is None else n * speed,
             "photons_per_frame": float(light.mean()),
             "electrons_per_frame": float(sensor.efficiency * light.mean()),
-            "blur_error": rms(light / n - sharp) / peak,
+            "blur_over_peak": rms(light / n - sharp) / peak,
             "psnr_db": colour.psnr(peak, rms(image - sharp)),
         }
         panels.append(Panel(f"{name}, {fps:g} fps", image, numbers))
@@ -95,7 +95,7 @@ def figure_2(clip: Clip, ppp: float, *, seed: int = 0, bits: Sequence[int] = BIT
             "fps": clip.frame_rate / m,
             "motion_px_per_frame": None if speed is None else m * speed,
             "detections_per_pixel": float(frame.fired.mean()),
-            "blur_error": rms(frame.photons / m - sharp) / peak,
+            "blur_over_peak": rms(frame.photons / m - sharp) / peak,
             "psnr_db": colour.psnr(peak, rms(image - sharp)),
         }
         shown = replace(plane, bits=b)

@@ -12,11 +12,13 @@ from functools import cached_property
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.sensor import devices
+from qsim.sensor import colour_filter, devices
 from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.defects import defect_table
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
+from qsim.sensor.spike import SpikeCamera
 
 MODELS = ("planes", "multibit")  # M binary planes, or one read of b bits
 GRID = 600  # light levels at which moments are tabulated
@@ -115,32 +117,50 @@ def at_depth(name: str, bits: int, ppp: float, exposure: float) -> Sensor:
     """Return a named sensor, or that of a file, with so many bits at `ppp` photons per pixel and exposure.
 
     A file of a SPAD, or of a QIS with gain 1 and no offset, is taken at every depth. `ValueError` for another file
-    whose sensor has other bits, because gain and offset belong to them.
+    whose sensor has other bits, because gain and offset belong to them. Spike cameras, defects and colour filters are
+    refused, too.
     """
     if not name.endswith(".toml"):
         return devices.load(name, ppp=ppp, bits=bits, exposure=exposure)
-    sensor = devices.load(name)
+    sensor = _of_file(name)
     if isinstance(sensor, BinarySPAD | CountingSPAD):
         return replace(sensor, bits=bits)
     if isinstance(sensor, QIS) and (sensor.gain, sensor.offset) == (1.0, 0.0):
         return replace(sensor, bits=bits)
-    if isinstance(sensor, QIS) and sensor.bits != bits:
+    if sensor.bits != bits:
         raise ValueError(
             f"{name}: its gain and offset belong to its {sensor.bits} bits, and {bits} are asked for; give a QIS of "
             f"gain 1 without offset, a SPAD, or for --sensor its own depth alone: --bits {sensor.bits}"
         )
-    return devices.load(name, bits=bits)
+    return sensor
+
+
+def _of_file(name: str) -> Sensor:
+    """Return the sensor of a file; `ValueError` for what the laws of this study do not hold for."""
+    sensor = devices.load(name)
+    if isinstance(sensor, SpikeCamera):
+        raise ValueError(
+            f"{name}: planes of a spike camera depend on each other, which this study does not model; name another "
+            "sensor"
+        )
+    for table, found in (("defects", defect_table.from_toml(name)), ("colour", colour_filter.from_toml(name))):
+        if found is not None:
+            raise ValueError(
+                f"{name}: this study is of perfect pixels without colour filters; name a file without the table "
+                f"[{table}]"
+            )
+    return sensor
 
 
 def plane_sensor(settings: StudySettings, ppp: float, exposure: float) -> Sensor:
     """Return the sensor of one binary plane; raise `ValueError` if the named one has more than one bit.
 
-    Unless one is named, efficiency and dark rate are those of the multi-bit read, whatever the bits of its file.
+    Unless one is named, efficiency and dark rate are those of the multi-bit read, whatever its bits.
     """
     if settings.plane is not None:
         return at_depth(settings.plane, 1, ppp, exposure)
-    bits = None if settings.sensor.endswith(".toml") else 1
-    read = devices.load(settings.sensor, ppp=ppp, bits=bits, exposure=exposure)
+    file = settings.sensor.endswith(".toml")
+    read = _of_file(settings.sensor) if file else devices.load(settings.sensor, ppp=ppp, exposure=exposure)
     return BinarySPAD(read.efficiency, read.dark_rate, 1)
 
 

@@ -168,3 +168,13 @@ def test_a_sensor_file_of_any_bits_compares_depths(clip, tmp_path, capsys):
     words = ["tradeoff", str(clip.path), "--ppp", "0.65", "--instants", "1", "--json"]
     assert main([*words, "--bits", "1,2", "--sensor", str(tmp_path / "spad.toml")]) == 0
     assert [row["bits"] for row in json.loads(capsys.readouterr().out)["rows"]] == [1, 2, 1, 2]
+
+
+@pytest.mark.parametrize("option", ["--sensor", "--plane-sensor"])
+def test_a_spike_camera_is_refused_before_anything_is_rendered(tmp_path, capsys, option):
+    text = '[sensor]\nmodel = "SpikeCamera"\nquantum_efficiency = 0.6\ndark_current = 100.0\nthreshold = 1000\n'
+    (tmp_path / "spike.toml").write_text(text)
+    words = ["tradeoff", "fan", "--ppp", "500", option, str(tmp_path / "spike.toml"), "-o", str(tmp_path / "out")]
+    assert main(words) == 2
+    assert "spike.toml: planes of a spike camera depend on each other" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -155,3 +155,21 @@ def test_a_seed_that_no_description_can_hold_is_refused(tmp_path: Path, seed: in
         sense(clip, Sensing("quiver-physical", 3, 3.25, seed=seed, name="s"))
     assert not list(clip.path.glob("streams/*"))
     assert sense(clip, Sensing("quiver-physical", 3, 3.25, seed=2**64 - 1, name="s"))[0].meta["seed"] == 2**64 - 1
+
+
+@pytest.mark.parametrize(
+    ("sensor", "settings"),
+    [
+        ("spad-320x240", {"bits": np.int64(2), "group": np.bool_(True), "ppp": np.float32(3.25)}),
+        ("quiver-paper", {"bits": np.uint8(3), "slices": np.int64(2), "lux": np.float32(2.5), "seed": np.int64(4)}),
+    ],
+)
+def test_numbers_of_numpy_are_those_of_python(tmp_path: Path, sensor: str, settings: dict):
+    """Codes and description are equal to the byte."""
+    clip = write_clip(tmp_path / "c", frames=7, height=8, width=9)
+
+    def written(given: dict) -> tuple[str, bytes, bytes]:
+        path = clip.sense(sensor, **given, force=True).path
+        return path.name, path.read_bytes(), path.with_suffix(".json").read_bytes()
+
+    assert written(settings) == written({name: value.item() for name, value in settings.items()})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from clips import colour_clip, write_clip
+from sensor_files import SPAD, sensor_file
 
 from qsim import colour
 from qsim.cli.program import main
@@ -56,6 +57,21 @@ def test_scores_are_psnr_below_white_clamped_there(stream):
     expected = 10 * np.log10(white**2 / np.mean(error**2))
     assert panels.score(light, truth) == f"{expected:.1f} dB"
     assert panels.score(truth, truth) == panels.score(truth, None) == ""
+
+
+def test_good_pixels_are_as_bright_as_the_truth_beside_hot_ones(tmp_path):
+    """1 % of hot pixels hold nearly all dark counts of the map; captions name what is not inverted."""
+    rates = np.full((40, 40), 20.0)
+    rates.flat[::101] = 2e5
+    np.save(tmp_path / "rates.npy", rates)
+    clip = write_clip(tmp_path / "even", radiance=np.full((11, 40, 40), 0.5), relative=True)
+    path = sensor_file(tmp_path, f'{SPAD}dark_map = "rates.npy"\ncrosstalk = 0.001\n', bits=4)
+    hot = clip.sense(path, ppp=3.0, name="hot")
+    frames = range(4, 7)
+    shown = panels.stream_panels(hot, frames, panels.truth_photons(clip, hot, frames))
+    for panel in shown:
+        assert panel.caption.endswith("; not inverted: crosstalk, dark rates of single pixels")
+    assert np.median(shown[1].frames) > 235, "the truth is 255; 2.5 of 3 photons too low is 113"
 
 
 def test_codes_without_a_rising_response_are_shown_as_they_are(tmp_path):

@@ -86,6 +86,20 @@ def test_command_writes_and_does_not_overwrite(folder, tmp_path, capsys):
     assert "--force" in capsys.readouterr().err
 
 
+def test_clips_whose_names_hold_a_dot_have_pages_of_their_own(tmp_path, monkeypatch):
+    """A folder's name has no ending: two speeds of a scene do not share one page. A file's ending is left out."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("fan_x0.25", "fan_x0.5"):
+        write_clip(tmp_path / name, frames=2, height=8, width=9)
+        assert main(["report", name]) == main(["explore", name]) == 0
+    found = {"setting": {"height": 64}, "costs": [{"method": "moment", "seconds_per_frame": 0.25}]}
+    (tmp_path / "bench.json").write_text(json.dumps(found))
+    assert main(["report", "bench.json"]) == 0
+    pages = {path.name for path in tmp_path.glob("*.html")}
+    clips = {"fan_x0.25.html", "fan_x0.25_explore.html", "fan_x0.5.html", "fan_x0.5_explore.html"}
+    assert pages == clips | {"bench.html"}
+
+
 @pytest.mark.parametrize("what", ["missing", "empty"])
 def test_a_path_without_results_is_refused(tmp_path, capsys, what):
     path = tmp_path / what

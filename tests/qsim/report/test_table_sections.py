@@ -127,6 +127,14 @@ def test_headings_have_units(tmp_path):
     assert "3 bits are best." in page.split("</header>")[0]
 
 
+@pytest.mark.parametrize("key", ["blur_over_peak", "blur_error"])
+def test_the_blur_of_a_figure_is_a_share_of_its_peak(tmp_path, key):
+    """Earlier versions stored it as `blur_error`, the name of the blur of a study in photons."""
+    figure = {"figure": 1, "rows": [{"clip": "fan", "panels": [{"label": "CMOS 60 fps", key: 0.03}]}]}
+    (tmp_path / "figure1.json").write_text(json.dumps(figure))
+    assert ">blur [of the peak]</th>" in study_section(tmp_path / "figure1.json").body
+
+
 def test_studies_costs_and_validations_have_their_sections(tmp_path):
     rows = [{"model": "planes", "bits": 3, "psnr_db": 21.25}, {"model": "multibit", "bits": 3, "psnr_db": None}]
     study = {"clip": "fan", "ppp": 0.65, "rows": rows, "structure_function": [0.0, 1.0]}

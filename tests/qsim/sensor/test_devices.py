@@ -96,6 +96,15 @@ def test_bits_replace_a_devices_own_depth():
     assert load("cmos-5.1e", bits=12).levels == 4096
 
 
+@pytest.mark.parametrize("bits", [1, 3, 7])
+def test_black_of_the_conventional_pixel_needs_eight_bits(bits):
+    """Its offset is 32 codes: with few bits every code would be the top one."""
+    with pytest.raises(ValueError, match=r"cmos-5\.1e: black is at code 32; give 8 bits or more"):
+        load("cmos-5.1e", bits=bits)
+    dark = load("cmos-5.1e", bits=8).mean(np.zeros(1), EXPOSURE)
+    assert float(dark[0]) == pytest.approx(32, abs=0.01)
+
+
 def test_the_listing_is_plain_data_with_one_row_per_device():
     import json
 

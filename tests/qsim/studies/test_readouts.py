@@ -7,6 +7,8 @@ import json
 import numpy as np
 import pytest
 from clips import colour_clip, write_clip
+from sensor_files import QIS as QIS_FILE
+from sensor_files import sensor_file
 
 from qsim.cli.program import main
 from qsim.clip.photons import clip_photons
@@ -104,3 +106,21 @@ def test_the_command_prints_a_table_and_refuses_what_cannot_be(tmp_path, capsys)
         said = capsys.readouterr().err
         assert message in said
         assert said.count("\n") == 1
+
+
+def test_the_dark_counts_of_hot_pixels_are_not_subtracted_from_all(tmp_path, capsys):
+    """The score is that of the dark rate of the good pixels, and the command names what is not inverted."""
+    rates = np.full((20, 20), 20.0)
+    rates.flat[::101] = 2e5
+    np.save(tmp_path / "rates.npy", rates)
+    clip = write_clip(tmp_path / "c", radiance=np.full((11, 20, 20), 0.5), relative=True)
+    stream = clip.sense(sensor_file(tmp_path, f'{QIS_FILE}dark_map = "rates.npy"\n', bits=4), ppp=3.0, name="hot")
+    clip.sense(EXACT, ppp=3.0, name="perfect")
+    found = compare(clip, span=11 / clip.frame_rate)
+    assert found.remarks == ("hot: not inverted: dark rates of single pixels",)
+    response = stream.sensor.with_dark_rate(20.0).response(stream.exposure)
+    error = response.invert(stream.codes().mean(axis=0), 11) - 3.0
+    expected = 20 * np.log10(2.5 * 3.0 / np.sqrt(np.mean(error**2)))
+    assert {row.stream: row.psnr_db for row in found.rows}["hot"] == pytest.approx(expected, abs=0.01)
+    assert main(["compare", str(clip.path)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == found.remarks[0]

@@ -94,14 +94,18 @@ def test_a_clip_of_an_edited_scene_file_is_refused(tmp_path, monkeypatch):
 
 
 def test_streams_of_a_sensor_file_have_every_depth(clip, tmp_path):
-    """Its bits are those of the depth, and its defects are drawn."""
+    """Its bits are those of the depth. With defects it is refused before a clip is written."""
     file = tmp_path / "spad.toml"
     text = '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 10.0\nbits = 2\n'
-    file.write_text(f"{text}[defects]\nprnu = 0.02\n")
+    file.write_text(text)
     made = write_streams(clip, tmp_path, StudySettings(bits=(1, 3), sensor=str(file), ppp=0.65))
     streams = [Clip.open(path).stream("multibit") for path in made]
     assert [stream.bits for stream in streams] == [1, 3]
-    assert all(stream.sensor.efficiency == 0.4 and "prnu" in stream.meta["defects"] for stream in streams)
+    assert all(stream.sensor.efficiency == 0.4 and "defects" not in stream.meta for stream in streams)
+    file.write_text(f"{text}[defects]\nprnu = 0.02\n")
+    with pytest.raises(ValueError, match=r"spad\.toml: .* without the table"):
+        write_streams(clip, tmp_path / "other", StudySettings(bits=(3,), sensor=str(file), ppp=0.65))
+    assert not (tmp_path / "other").exists()
 
 
 def test_planes_that_cannot_be_summed_are_refused_before_the_study(clip, tmp_path, monkeypatch, capsys):

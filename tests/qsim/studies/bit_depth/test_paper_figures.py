@@ -35,7 +35,7 @@ def test_four_cameras_see_the_same_light(tmp_path):
         per_lux = photons_per_lux(clip.camera, 1 / panel.numbers["fps"])
         assert panel.numbers["photons_per_frame"] == pytest.approx(per_lux, rel=1e-3)
         assert panel.numbers["electrons_per_frame"] == pytest.approx(0.8 * per_lux, rel=1e-3)
-        assert panel.numbers["blur_error"] == pytest.approx(0, abs=1e-9)
+        assert panel.numbers["blur_over_peak"] == pytest.approx(0, abs=1e-9)
     slow, _, fast, quanta = panels[1:]
     # Linear, unclipped at 66 e-: variance (electrons + 5.1^2 + rounding) / electrons^2 of the light
     electrons = slow.numbers["electrons_per_frame"]

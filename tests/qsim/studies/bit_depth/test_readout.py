@@ -9,6 +9,7 @@ from qsim.studies.bit_depth.readout import Readout, StudySettings, plane_sensor,
 SPAD = '[sensor]\nmodel = "BinarySPAD"\npde = 0.3\ndark_count_rate = 25.0\nbits = 4\n'
 COUNTER = '[sensor]\nmodel = "CountingSPAD"\npde = 0.3\ndark_count_rate = 25.0\ndead_time = 5e-8\nbits = 8\n'
 QIS = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.3\ndark_current = 25.0\nread_noise = 0.2\nbits = 3\n'
+SPIKE = '[sensor]\nmodel = "SpikeCamera"\nquantum_efficiency = 0.6\ndark_current = 100.0\nthreshold = 1000\n'
 
 
 def test_a_readout_of_planes_is_the_spad_that_sums_them():
@@ -49,3 +50,29 @@ def test_a_gain_belongs_to_the_bits_of_its_file(tmp_path, own):
     assert multibit.sensor.bits == 3
     with pytest.raises(ValueError, match="belong to its 3 bits, and 1 are asked for"):
         plane_sensor(StudySettings(plane=file), 0.65, 1e-4)
+
+
+@pytest.mark.parametrize("name", ["sensor", "plane"])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"{SPAD}[defects]\nprnu = 0.02\n", r"perfect pixels .* name a file without the table \[defects\]"),
+        (f'{SPAD}[colour]\nmask = "rggb"\n', r"perfect pixels .* name a file without the table \[colour\]"),
+        (SPIKE, "planes of a spike camera depend on each other, which this study does not model"),
+    ],
+)
+def test_sensors_that_the_laws_do_not_hold_for_are_refused(tmp_path, name, text, message):
+    (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(ValueError, match=rf"mine\.toml: .*{message}"):
+        readouts(StudySettings(**{name: str(tmp_path / "mine.toml")}), 0.65, 1e-4)
+
+
+def test_a_table_of_defects_without_any_is_a_perfect_sensor(tmp_path):
+    (tmp_path / "mine.toml").write_text(f"{SPAD}[defects]\nprnu = 0.0\n")
+    assert readouts(StudySettings(bits=(2,), sensor=str(tmp_path / "mine.toml")), 0.65, 1e-4)[1].sensor.bits == 2
+
+
+def test_a_conventional_pixel_is_compared_with_planes_of_its_efficiency():
+    planes, multibit = readouts(StudySettings(bits=(9,), sensor="cmos-5.1e"), 0.65, 1e-4)
+    assert planes.sensor == BinarySPAD(0.8, 1.6, 1)
+    assert multibit.sensor.bits == 9

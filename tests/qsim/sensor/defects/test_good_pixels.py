@@ -1,0 +1,52 @@
+"""The dark rate of good pixels is theirs, and the defects that one response leaves out are named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from clips import write_clip
+from sensor_files import QIS, SPAD, sensor_file
+
+from qsim.sensor.defects import good_pixels
+
+PPP, SIZE, HOT = 3.0, (40, 40), slice(None, None, 101)  # 1 % of the pixels are hot
+
+
+def hot_stream(folder, more: str = "", model: str = QIS):
+    """Return a stream of an even still field: 20 dark counts per second, hot pixels 100 in a frame of 0.5 ms."""
+    rates = np.full(SIZE, 20.0)
+    rates.flat[HOT] = 2e5
+    np.save(folder / "rates.npy", rates)
+    clip = write_clip(folder / "c", radiance=np.full((11, *SIZE), 0.5), relative=True)
+    path = sensor_file(folder, f'{model}dark_map = "rates.npy"\n{more}', bits=4)
+    return clip.sense(path, ppp=PPP, name="hot")
+
+
+def test_light_of_good_pixels_is_found_beside_hot_ones(tmp_path):
+    """Within five sigma of photon noise; the mean rate of all pixels makes it 1.2 of 3 photons too low."""
+    stream = hot_stream(tmp_path)
+    sensor, left = good_pixels.of_stream(stream.sensor, stream.meta)
+    assert left == "not inverted: dark rates of single pixels"
+    assert sensor.dark_rate == pytest.approx(20.0)
+    good = np.ones(SIZE, bool)
+    good.flat[HOT] = False
+    codes = stream.codes()[:, good]
+    found = sensor.response(stream.exposure).invert(codes.mean(), codes.size)
+    assert abs(found - PPP) < 5 * np.sqrt(PPP / sensor.efficiency * 1.3 / codes.size)  # with read noise and rounding
+    assert abs(stream.sensor.response(stream.exposure).invert(codes.mean(), codes.size) - PPP) > 1
+
+
+def test_the_rest_is_named(tmp_path):
+    stream = hot_stream(tmp_path, "crosstalk = 0.05\ndead = 0.1\ndevice_seed = 3\n", SPAD)
+    _, left = good_pixels.of_stream(stream.sensor, stream.meta)
+    assert left == "not inverted: crosstalk, dark rates of single pixels, dead"
+    np.save(tmp_path / "rates.npy", np.ones(SIZE))
+    sensor, left = good_pixels.of_stream(stream.sensor, stream.meta)
+    assert sensor == stream.sensor
+    assert left.startswith("no defect is inverted: ")
+    assert left.endswith("rates.npy has changed since the stream was drawn")
+
+
+def test_a_stream_without_defects_keeps_its_sensor(tmp_path):
+    stream = write_clip(tmp_path / "c", frames=2, height=6, width=7).sense("spad512s", ppp=1.0, name="s")
+    assert good_pixels.of_stream(stream.sensor, stream.meta) == (stream.sensor, "")
