@@ -37,9 +37,9 @@ def choose(
 ) -> Mixture:
     """Return the noise of the clips' streams, changed to the requested sensors, light levels [photons/pixel] and bits.
 
-    A requested sensor has the light, bits and defects of its own streams. Without any, it has light and bits of other
-    streams, and the defects of its own file. Without streams, the default sensor and light are used. `ValueError` for
-    a stream whose noise training windows cannot have.
+    A requested sensor has the light, bits and defects of its streams. Without any, it has light and bits of other
+    streams, and the defects of its file. Without streams, the default sensor and light are used. `ValueError` for a
+    stream whose noise training windows cannot have.
     """
     asked = bool(sensors or ppp or bits)
     streams = _streams(clips)
