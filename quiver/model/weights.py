@@ -153,15 +153,16 @@ def annotate(path: Path, notes: Mapping[str, str]) -> None:
 
 
 class _WithoutValues(TorchFunctionMode):
-    """Makes layers without first values, which a file replaces: every function that works in place does nothing.
+    """Makes layers without first values, which a file replaces: every function that sets values in place does nothing.
 
-    On "meta", the first of some of these functions imports for two seconds.
+    On "meta", the first of some of these functions imports for two seconds. `t_` acts, because it sets a
+    shape: `torch.nn.init.orthogonal_` needs it, which does nothing on "meta" in later versions of torch only.
     """
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        if func.__name__.endswith("_") and not func.__name__.endswith("__"):
+        if func.__name__.endswith("_") and not func.__name__.endswith("__") and func.__name__ != "t_":
             return args[0] if args else (kwargs or {})["tensor"]  # the latter for functions of torch.nn.init
         return func(*args, **(kwargs or {}))
 

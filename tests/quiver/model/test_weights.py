@@ -147,6 +147,28 @@ def test_every_network_is_read_with_equal_values_and_without_slow_imports(tmp_pa
     assert done.stdout == "\n"
 
 
+def test_networks_are_read_where_orthogonal_values_are_made_on_meta_too(tmp_path: Path, monkeypatch):
+    """`orthogonal_` of torch 2.9 to 2.11: weights of MemDeblur could not be read."""
+
+    def orthogonal(tensor: torch.Tensor) -> torch.Tensor:
+        wide = tensor.shape[0] < tensor[0].numel()
+        values = tensor.new_empty(tensor.shape[0], tensor[0].numel()).normal_()
+        if wide:
+            values.t_()
+        values = torch.linalg.qr(values)[0]
+        if wide:
+            values.t_()
+        with torch.no_grad():
+            tensor.view_as(values).copy_(values)
+        return tensor
+
+    monkeypatch.setattr(nn.init, "orthogonal_", orthogonal)
+    network = EVERY["memdeblur"]()
+    save(network, network.config, tmp_path / "w.safetensors")
+    back = load(tmp_path / "w.safetensors").state_dict()
+    assert all(torch.equal(back[name], value) for name, value in network.state_dict().items())
+
+
 def test_the_shipped_weights_are_those_of_the_preset():
     assert load(weights_path("mergenet")).config == OTHERS["mergenet"]
 
