@@ -135,6 +135,8 @@ CASES: dict[str, QISCase | SPADCase] = {
     "low gain": QISCase(gain=3.0, offset=10.0, bits=7),
     "planes": SPADCase(),
     "planes, many frames": SPADCase(frames=150, side=16),
+    "planes, afterpulses": SPADCase(afterpulsing=0.03),
+    "few dark counts, afterpulses": SPADCase(dark_rate=1.0, afterpulsing=0.03),
     "counts": COUNTER,
     "paralyzable counts": replace(COUNTER, dead_time=0.08, paralyzable=True),
 }
