@@ -31,8 +31,9 @@ AT = f"{float(LIGHTS[0]):g} PPP, 3 bit"
 NAMES = tuple(name for name in ROWS if not name.endswith(RECORD) and not name.startswith(APART))
 LIMITS = f"""Every network saw the same number of windows, with as many frames as its design takes. A large one needed
 more time for them: the table of [equal time](equal_budget.md) asks the other question. This is still a short training,
-so the order can change with a longer one. Frames: those of which one is restored, and how many of them lie ahead. An
-earlier version made the rows of QBP and QBP + BM3D, whose frames near the ends of clips are others since.
+so the order can change with a longer one. Windows have 80 x 80 px, those of RVRT 128 x 128 px, because it fills smaller
+ones to 132 px. Frames: those of which one is restored, and how many of them lie ahead.
+memdeblur has no scores: its weights could not be read on the machine that trained them, a defect that is mended.
 Networks below {FLOOR} have no rank."""
 
 
