@@ -147,7 +147,7 @@ def learned(name: str, args: argparse.Namespace, budget: Budget) -> tuple[Path, 
     return folder, row | of_design(folder / "best.safetensors")
 
 
-def lights_of(name: str, args: argparse.Namespace, budget: Budget, validation: float) -> tuple[str, ...]:
+def lights_of(name: str, args: argparse.Namespace, budget: Budget, validation: float | None) -> tuple[str, ...]:
     """Return the light levels at which a network is scored.
 
     One of published width is scored at the light of training alone, and only if its last validation [dB] is above
@@ -157,7 +157,7 @@ def lights_of(name: str, args: argparse.Namespace, budget: Budget, validation: f
         return LIGHTS
     words = ([FLOOR], args.work / f"{name}_floor", args.data, LIGHTS[:1], budget, "val")
     floor = next(iter(scores(*words)[FLOOR].values()))
-    return LIGHTS[:1] if validation > mean_of(floor) else ()
+    return LIGHTS[:1] if validation is not None and validation > mean_of(floor) else ()
 
 
 def apart(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
@@ -192,7 +192,7 @@ def of_design(weights: Path) -> dict[str, Any]:
     found, method = load(weights), restorer(str(weights))
     restoring = found.student if isinstance(found, StudentTeacher) else found
     count = sum(parameter.numel() for parameter in restoring.parameters())
-    frames = {"window": method.window, "look_ahead": method.look_ahead}
+    frames = {"window": method.frames_used, "look_ahead": method.look_ahead}
     return {"parameters": count, "macs_per_pixel": design_macs(found.config)} | frames
 
 
@@ -207,7 +207,7 @@ def train(name: str, rate: str, folder: Path, data: Path, budget: Budget, *, sho
         "quiver-s": ["control", "--loss", "published"],
     }
     design = name.removesuffix("-1m")
-    crop = CROPS.get(design, budget.crop) if budget.crop == Budget.crop else budget.crop  # trials have small ones
+    crop = CROPS.get(name, budget.crop) if budget.crop == Budget.crop else budget.crop  # trials have small ones
     quiver(
         *("train", data, "-o", folder, "--preset", name, "--protocol", *own.get(design, ["quick"])),
         *budget.length(trial=short),

@@ -225,11 +225,13 @@ def make_row(
 
 
 def check_row(path: Path, budget: Budget, data: Path) -> None:
-    """Raise `ValueError` if a row was made with another budget or on another data set."""
+    """Raise `ValueError` if a row was made with another budget or on another data set, or an error if it is missing."""
     found = read_json(path)
     wanted = {"budget": asdict(budget), "data": data.name, "recipe_sha256": recipe_digest(data)}
     for name, value in wanted.items():
         if found.get(name) != value:
+            if name == "recipe_sha256" and not data.is_dir():
+                raise FileNotFoundError(f"{data}: no such data set")
             raise ValueError(f"{path}: was made with {name} {found.get(name)}; now it is {value}; choose another --out")
 
 

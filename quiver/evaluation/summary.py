@@ -172,10 +172,11 @@ def frames_of(method: Restorer, *, published: bool) -> tuple[int | None, int]:
 
     A published window holds PUBLISHED_EDGE frames on each side.
     """
-    past, future = method.window - 1 - method.look_ahead, method.look_ahead
+    future = method.look_ahead
     if published:
-        past, future = min(past, PUBLISHED_EDGE), min(future, PUBLISHED_EDGE)
-    return past + 1 + future if published or method.seamless else None, future
+        past, future = min(method.window - 1 - future, PUBLISHED_EDGE), min(future, PUBLISHED_EDGE)
+        return past + 1 + future, future
+    return method.frames_used if method.seamless else None, future
 
 
 def _cells(line: SummaryLine, method: Restorer, published: bool) -> list[str]:

@@ -77,6 +77,12 @@ class Restorer:
     scope: Scope | None = None  # of a network: the streams that it was measured for or trained on; None: not known
     device: str = "cpu"  # where it runs
     earlier: Restorer | None = None  # with the description and identity that earlier versions stored, if they differ
+    seen: int | None = None  # most frames used for one, if the first and the last of `window` are never used together
+
+    @property
+    def frames_used(self) -> int:
+        """Most frames used for one restored frame."""
+        return self.window if self.seen is None else self.seen
 
     def restore(self, codes: Codes, first: int = 0, last: int | None = None, progress: Progress | None = None) -> Array:
         """Return photons, float32 [last - first, H, W], of frames first ... last - 1; of all frames by default.

@@ -72,7 +72,7 @@ def wrap_network(
     device = pick_device(options.device)
     model.to(device).eval()
     run: RestoreNetwork = fill_network
-    window, look_ahead, together = WINDOW, RADIUS, 1
+    window, look_ahead, together, seen = WINDOW, RADIUS, 1, None
     if mode == "streaming":  # features reach further, and the state back to the first frame
         window, look_ahead = WINDOW + REACH, RADIUS + REACH
     if isinstance(model, MergeNet):
@@ -81,6 +81,7 @@ def wrap_network(
         part = part_of(model)
         run, window, look_ahead, together = fill_parts, part.past + 1 + part.future, part.future, part.kept
         description = f"{description}; look-ahead {look_ahead} frames"
+        seen = min(window, part.seen)
 
     told: set[str] = set()  # sources whose light was too bright: blocks, windows and places of a mask are told once
 
@@ -96,8 +97,9 @@ def wrap_network(
         return cut_pieces(model, height, width, options.bound(host=isinstance(model, MergeNet))).text
 
     return Restorer(
-        name, window, look_ahead, True, description, fill, mode != "streaming", identity, cut, together, device=device
-    )
+        name, window, look_ahead, True, description, fill, mode != "streaming", identity, cut, together, device=device,
+        seen=seen,
+    )  # fmt: skip
 
 
 def excess(codes: Codes, out: Array, first: int) -> str | None:

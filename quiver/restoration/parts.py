@@ -32,6 +32,11 @@ class ClipPart:
     past: int  # most frames before a restored one that it depends on
     future: int  # most frames after it
 
+    @property
+    def seen(self) -> int:
+        """Frames that the network has at a time."""
+        return self.before + self.kept + self.after
+
 
 def takes_clips(network: nn.Module) -> bool:
     """Return whether a network restores every frame of a clip: the compared networks do, and state a look-ahead."""

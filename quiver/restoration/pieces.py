@@ -53,8 +53,13 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces
 
     stated, memory = memory, max(memory - weight_bytes(model), 0)
     pixels = memory // bytes_per_pixel(model)
-    if height * width <= pixels:
+    least = int(getattr(model, "least", 1))  # px: smaller tiles are filled to this side
+    if max(height, least) * max(width, least) <= pixels:
         return Pieces(cut_tiles(height, width, height * width, 0))
+    if least * least > pixels:
+        raise ValueError(
+            f"the memory bound holds {pixels} pixels at a time; a tile needs at least {least} x {least}; raise --memory"
+        )
     reach = getattr(model, "reach", None)
     if reach is not None:
         return Pieces(cut_tiles(height, width, pixels, reach, int(model.multiple)))  # type: ignore[arg-type]
@@ -110,9 +115,11 @@ CLIP_BYTES = {
 def clip_bytes(network: Any) -> int:
     """Return the working memory per pixel of a network that takes clips: about 1.5 times of what was measured."""
     part = part_of(network)
-    first, more = CLIP_BYTES[type(network).__name__]
+    name = type(network).__name__
+    first, more = CLIP_BYTES[name]
     share = network.config.width / type(network.config)().width
-    return 500 + int(1.5 * (share * first + more * (part.before + part.kept + part.after)))
+    of_frame = more * max(share, 1) if name == "Bit2Bit" else more  # its layers hold all frames of a part
+    return 500 + int(1.5 * (share * first + of_frame * part.seen))
 
 
 @dataclass(frozen=True)

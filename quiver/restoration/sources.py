@@ -133,7 +133,7 @@ def assumed(codes: Codes, method: Restorer) -> str:
         rows, columns = codes.colour.tile
         light += f", each of {rows} x {columns} places of the colour filters alone, then demosaiced"
     light += f", {bad} of {height * width} pixels defective and filled from their neighbours" if bad else ""
-    seen = f"{method.window} frames" if method.seamless else f"all earlier and {method.look_ahead} later frames"
+    seen = f"{method.frames_used} frames" if method.seamless else f"all earlier and {method.look_ahead} later frames"
     return (
         f"{codes.name}: {length} frames of {height} x {width}, {codes.frame_rate:g} codes/s; "
         f"sensor {sensor}, {codes.sensor.bits} bit{light}, white = {codes.white:.4g} photons; "

@@ -61,6 +61,13 @@ def test_a_missing_data_set_is_one_sentence(program, words, tmp_path, monkeypatc
     assert program.main(["none", "--tiny", "--out", "r", "--rows", *words]) == 2
     assert capsys.readouterr().err == f"{program.__name__}: none: no such data set\n"
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+    (tmp_path / "r").mkdir(exist_ok=True)
+    length = 2 if program is equal_steps else None
+    budget = Steps(crop=rows.TINY.crop, batch=rows.TINY.batch, steps=2) if length else rows.TINY
+    row = {"budget": asdict(budget), "data": "none", "recipe_sha256": "0"}  # it was taken for one of another data set
+    (tmp_path / "r/unet.json").write_text(json.dumps(row))
+    assert program.main(["none", "--tiny", "--out", "r", "--rows", *words]) == 2
+    assert capsys.readouterr().err == f"{program.__name__}: none: no such data set\n"
 
 
 def test_a_trial_that_diverges_is_the_worst(tmp_path, monkeypatch):
@@ -92,9 +99,10 @@ def test_a_published_width_is_scored_only_above_the_floor(tmp_path, monkeypatch)
 
     monkeypatch.setattr(equal_budget, "scores", found)
     args = argparse.Namespace(work=tmp_path, data=tmp_path)
+    assert equal_budget.lights_of("emvd", args, rows.TINY, None) == ()
     lights = [equal_budget.lights_of("emvd", args, rows.TINY, psnr) for psnr in (15.9, 16.1)]
     assert lights == [(), ("3.25",)]
-    assert asked == 2 * [(["moment:3"], ("3.25",), "val")]
+    assert asked == 3 * [(["moment:3"], ("3.25",), "val")]
     assert equal_budget.lights_of("emvd-1m", args, rows.TINY, -1.0) == rows.LIGHTS
 
 
@@ -324,7 +332,8 @@ def test_busy_cores_are_no_option_of_equal_steps(program, tmp_path, capsys):
 def test_rvrt_gets_crops_that_it_does_not_fill(tmp_path, monkeypatch):
     asked = {}
     monkeypatch.setattr(equal_budget, "quiver", lambda *words, budget: asked.update(pairwise(words)))
-    for name, budget, crop in (("rvrt", rows.Budget(), 128), ("unet", rows.Budget(), 80), ("rvrt-1m", rows.TINY, 32)):
+    full = rows.Budget()  # rvrt-1m fills nothing: its flow has two levels less
+    for name, budget, crop in (("rvrt", full, 128), ("rvrt-1m", full, 80), ("unet", full, 80), ("rvrt", rows.TINY, 32)):
         equal_budget.train(name, "1e-4", tmp_path, tmp_path, budget)
         assert asked["--crop"] == crop
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from qsim.sensor.qis import QIS
 from quiver.cli.program import main
-from quiver.data.codes import Codes
+from quiver.data.codes import Codes, array_codes
 from quiver.data.noise import noise_table
 from quiver.model.presets import build
 from quiver.model.rivals.edges import reflected
@@ -181,3 +181,17 @@ def test_only_a_tile_of_a_part_becomes_float32():
         tracemalloc.stop()
     np.testing.assert_allclose(tiled, whole, rtol=1e-5)
     assert peak < 4 * (part.kept + part.after) * 256 * 256
+
+
+@pytest.mark.parametrize("name", ["memdeblur", "bit2bit"])
+def test_a_frame_depends_on_as_many_frames_as_is_stated(name):
+    """23 and 47 were stated: the most frames before and after, which no frame sees both of."""
+    method, codes = wrap_network(tiny(name), name, name, RestoreOptions(device="cpu")), random_codes(56, 16, 16)
+    data, frame, changes = codes.read(0, 56), 20, []
+    before = method.restore(codes, frame, frame + 1)
+    for t in range(56):
+        other = data.copy()
+        other[t] = 7 - other[t]
+        restored = method.restore(array_codes(other, codes.sensor, codes.exposure), frame, frame + 1)
+        changes.append(not np.array_equal(restored, before))
+    assert sum(changes) == method.frames_used < method.window

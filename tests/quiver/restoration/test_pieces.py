@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from quiver.restoration.pieces import bytes_needed, cut_pieces
 from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import restorer
 
+ROOT = Path(__file__).parents[3]
 SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
 
 
@@ -45,6 +48,26 @@ def quiet(method: Restorer, codes: Codes) -> Array:
 
 
 # Geometry
+
+
+def test_tiles_that_rvrt_would_fill_are_refused():
+    """It computes 64 px as 132 px: a bound of 200 MB took 367 MB."""
+    network = build("rvrt")
+    with pytest.raises(ValueError, match=r"a tile needs at least 132 x 132; raise --memory$"):
+        cut_pieces(network, 64, 64, 200_000_000)
+    assert cut_pieces(network, 64, 64, bytes_needed(network, 132, 132)).exact
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "docs/results/equal_budget").glob("*.json")), ids=lambda path: path.stem
+)
+def test_what_a_network_took_is_within_what_is_expected(path):
+    """The rows of equal time hold what restoring frames of 128 x 128 px took; bit2bit-1m took 27 % more."""
+    row = json.loads(path.read_text())
+    if "cost" in row:
+        with torch.device("meta"):
+            network = build(row["name"])
+        assert row["cost"]["peak_bytes"] < bytes_needed(network, 128, 128)
 
 
 def test_the_reach_of_the_small_unet_is_what_it_says():

@@ -235,7 +235,8 @@ def test_the_device_is_stated_and_may_change(tmp_path, blocks_of_four):
     interrupted(codes, moment, tmp_path / "r.npy")
     assert json.loads((tmp_path / "r.npy.part.json").read_text())["device"] == "cpu"
     assert resumed(codes, replace(moment, device="cuda"), tmp_path / "r.npy") == ([4, 8], [])
-    assert json.loads((tmp_path / "r.json").read_text())["device"] == "cuda"
+    told = json.loads((tmp_path / "r.json").read_text())
+    assert (told["device"], told["look_ahead"]) == ("cuda", 5)
 
 
 def test_a_writer_killed_between_the_two_renames_is_finished_by_the_same_command(tmp_path, monkeypatch, capsys):
