@@ -30,6 +30,7 @@ from qsim.process import peak_memory
 PILOT = "pilot and compilation of kernels"  # before the first frame of a renderer
 RESUMES = "the same command resumes where it stopped"
 STARTS_AGAIN = "no incomplete file is left; run the same command again"
+WITHOUT_FORCE = "the same command without --force resumes where it stopped"
 MAKES_AGAIN = "finished files stay; the same command with --force makes all of them again"
 
 # Names of options in other programs -> ours, suggested if the command has ours.

@@ -51,7 +51,8 @@ def _run_demo(args: argparse.Namespace) -> int:
         steps(out, args.quiet or args.json)
     except subprocess.CalledProcessError as error:
         step = shlex.join(error.cmd[2:])
-        return failed(f"qsim demo: stopped at '{step}'; `qsim demo` resumes there", error.returncode, args.json)
+        again = shlex.join(["qsim", "demo", str(out)])
+        return failed(f"qsim demo: stopped at '{step}'; `{again}` resumes there", error.returncode, args.json)
     minutes, peak = (time.perf_counter() - started) / 60, peak_memory_of_children()
     page = out / "index.html"
     facts = {"page": str(page), "minutes": minutes, "largest_process_bytes": peak}

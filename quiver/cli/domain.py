@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.cli.console import bar, output
+from qsim.cli.console import WITHOUT_FORCE, bar, output
 from qsim.cli.options import checked, numbers, whole_numbers, words
 from quiver.cli.options import add_running, command, running_options, use_threads
 
@@ -49,6 +49,8 @@ def _run_domain(args: argparse.Namespace) -> int:
     from quiver.restoration.networks import network_restorer
     from quiver.restoration.restorers import weights_path
     from quiver.restoration.sources import refuse, refuse_idle
+    if args.force:
+        args.after_interrupt = WITHOUT_FORCE
 
     path = weights_path(args.weights)
     if args.clips:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qsim import checks
-from qsim.cli.console import bar, note, output
+from qsim.cli.console import WITHOUT_FORCE, bar, note, output
 from qsim.cli.options import check_free, checked, count, frame_size, positive, words
 from qsim.files import write_bytes, write_json
 from qsim.locks import Lock
@@ -82,6 +82,8 @@ def _run_evaluate(args: argparse.Namespace) -> int:
     from quiver.restoration.restorers import restorers
     from quiver.restoration.sources import refuse_idle
 
+    if args.force:
+        args.after_interrupt = WITHOUT_FORCE
     threads.check(args.threads)
     methods = restorers(args.methods, running_options(args))
     refuse_idle(vars(args), methods)

@@ -62,19 +62,25 @@ def light_levels(text: str) -> tuple[float, ...]:
 
 
 def add_noise(parser: argparse.ArgumentParser) -> None:
-    """Add --sensor, --ppp and --bits of training; values that are not given come from the streams of the data set."""
+    """Add --sensor, --ppp and --bits of training.
+
+    Values that are not given are those of the protocol, if it has any; else those of the streams of the data set.
+    """
     parser.add_argument(
         "--sensor",
         type=words,
-        help="names of `qsim doctor --devices` or .toml files, comma-separated (default: the data set's streams')",
+        help="names of `qsim doctor --devices` or .toml files, comma-separated (default: the protocol's, as mergenet "
+        "has them, else the data set's streams')",
     )
     parser.add_argument(
         "--ppp",
         type=light_levels,
         help=f"mean photons per pixel and exposure; several: 1,10, or {LEVELS} in a range: 0.3..100 (default: the "
-        "streams')",
+        "protocol's, else the streams')",
     )
-    parser.add_argument("--bits", type=whole_numbers, help="bits per code; several: 1,3 (default: the streams')")
+    parser.add_argument(
+        "--bits", type=whole_numbers, help="bits per code; several: 1,3 (default: the protocol's, else the streams')"
+    )
 
 
 def add_running(parser: argparse.ArgumentParser, *, resumed: bool = True) -> None:
@@ -82,7 +88,7 @@ def add_running(parser: argparse.ArgumentParser, *, resumed: bool = True) -> Non
     parser.add_argument(
         "--memory",
         type=memory_size,
-        help="working memory, as in 500MB (default 2GB; of a network on a GPU half of the GPU's)",
+        help="working memory, as in 500MB (default 2GB; of a network but mergenet on a GPU half of the GPU's)",
     )
     parser.add_argument("--mode", choices=MODES, help="networks: how frames share work (default exact)")
     parser.add_argument("--device", choices=DEVICES, help="networks: where they run (default auto)")

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.cli.console import failed, note, output
+from qsim.cli.console import WITHOUT_FORCE, failed, note, output
 from qsim.cli.options import check_free, checked, count, nonnegative, positive
 from qsim.files import sha256
 from quiver.cli.options import (
@@ -101,6 +101,8 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver.restoration.restorers import weights_path
     from quiver.training.loop import Diverged, train
     from quiver.training.run_folder import draw_curve
+    if args.force:
+        args.after_interrupt = WITHOUT_FORCE
 
     first = None if args.start is None else weights_path(args.start)
     args.start = None if first is None else _start(args, first)
@@ -138,7 +140,7 @@ def _run_train(args: argparse.Namespace) -> int:
         draw_curve(folder, state.history)
         output(args, *_summary(folder, state))
     if interrupted:
-        print("quiver: interrupted; the same command resumes where it stopped", file=sys.stderr)
+        print(f"quiver: interrupted; {args.after_interrupt}", file=sys.stderr)
         return 130
     return 0
 

@@ -109,6 +109,8 @@ class Windows(Dataset[dict[str, Any]]):
         for noise in self.noise.noises:
             for clip in (lit if noise.defects is None else sized).values():
                 check_windows(noise, clip)
+                if prepare is not None:  # from the response, which some sensors do not have
+                    noise.draw(clip).sensor.response(clip.exposure, points=2)
         self.length = len(clips) * (len(self.noise.noises) if fixed else repeats)
         self._draws: dict[tuple[int, int], tuple[Draw, Array | None, Sensor]] = {}
 
@@ -181,7 +183,7 @@ class Windows(Dataset[dict[str, Any]]):
                 codes = draw_codes(draw.sensor, photons * scale, clip.exposure, place.key)
             else:
                 drawn = window_codes(noise, draw, clip, place, self.settings.frames, self.settings.crop, scale)
-                filler = window_filler(bad, place, self.settings.crop)
+                filler = window_filler(bad, place, self.settings.crop, behind)
                 drawn = drawn if filler is None else filler.fill(drawn, 0)
                 codes = turned(drawn, replace(place, backwards=False))  # in the order of exposure already
         except ValueError as error:

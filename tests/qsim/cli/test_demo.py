@@ -69,7 +69,9 @@ def test_a_failed_step_is_named(tmp_path: Path, monkeypatch, capsys):
 
     monkeypatch.setattr(demo, "call", fail)
     assert qsim.cli.program.main(["demo", str(tmp_path / "d"), "-q"]) == 1
-    assert "stopped at 'qsim generate demo -o" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "stopped at 'qsim generate demo -o" in told
+    assert told.endswith(f"; `qsim demo {tmp_path / 'd'}` resumes there\n")
     assert qsim.cli.program.main(["demo", str(tmp_path / "d"), "--json"]) == 1
     out, err = capsys.readouterr()
     assert json.loads(out) == {"error": err.strip(), "exit_code": 1}

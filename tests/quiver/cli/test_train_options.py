@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +16,14 @@ from safetensors.torch import load_file
 from sensor_files import FILES, sensor_file
 
 from qsim.files import sha256
+from quiver import threads
+from quiver.cli import train
 from quiver.cli.program import main
 from quiver.evaluation import domain_measurement
 from quiver.evaluation.cost import checked_cases
 from quiver.evaluation.metrics import Score
 from quiver.model.weights import annotate
-from quiver.training import ablation, loop
+from quiver.training import ablation, loop, run_folder
 from quiver.training.run_folder import alone_in
 
 FAST = ("--steps", "2", "--crop", "16", "--batch", "1", "--preset", "unet", "--protocol", "control")
@@ -194,6 +197,45 @@ def test_a_damaged_ablation_is_refused_without_force(capsys, tiny_dataset, tmp_p
     (tmp_path / "x/none/settings.json").write_text(json.dumps({"noise": []}))
     said = told(capsys, "ablate", tiny_dataset, "-o", tmp_path / "x", "--steps", 1, "-q")
     assert said.endswith("settings.json: noise is []; choose another -o\n")
+
+
+def test_force_keeps_a_run_where_the_sensor_tells_nothing(capsys, tiny_dataset, tmp_path):
+    """The first window said so, when the run was gone."""
+    words = ["train", tiny_dataset, "-o", tmp_path / "r", "--preset", "emvd", "--steps", 1, "--crop", 16, "--batch", 1]
+    assert main([*map(str, words), "-q"]) == 0
+    before = sha256(tmp_path / "r/best.safetensors")
+    dark = sensor_file(tmp_path, f"[sensor]\n{FILES['QIS']}bits = {{bits}}\n".replace("= 100.0", "= 1e9"), bits=3)
+    capsys.readouterr()
+    assert "does not rise with light" in told(capsys, *words, "--sensor", dark, "--ppp", 3.25, "--force", "-q")
+    assert sha256(tmp_path / "r/best.safetensors") == before
+
+
+@pytest.mark.parametrize("words", [[], ["--force"]], ids=["again", "force"])
+def test_an_interrupted_run_is_resumed_without_force(capsys, tiny_dataset, tmp_path, monkeypatch, words):
+    """With --force the same command deletes what it should resume."""
+
+    def interrupted(*_: object, should_stop: object, **__: object) -> loop.State:
+        signal.raise_signal(signal.SIGINT)
+        return loop.State()
+
+    monkeypatch.setattr(loop, "train", interrupted)
+    monkeypatch.setattr(run_folder, "draw_curve", lambda *_: None)
+    monkeypatch.setattr(train, "_summary", lambda *_: ({}, ""))
+    assert main(["train", str(tiny_dataset), "-o", str(tmp_path / "r"), "--steps", "1", "-q", *words]) == 130
+    again = "the same command without --force" if words else "the same command"
+    assert capsys.readouterr().err == f"quiver: interrupted; {again} resumes where it stopped\n"
+
+
+@pytest.mark.parametrize("command", ["evaluate", "domain"])
+def test_interrupted_measurements_are_resumed_without_force(capsys, tiny_dataset, tmp_path, monkeypatch, command):
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(threads, "check", interrupted)
+    (tmp_path / "o").mkdir()
+    words = [weights(tmp_path), tiny_dataset] if command == "domain" else [tiny_dataset, "-o", tmp_path / "o"]
+    assert main([command, *map(str, words), "--force"]) == 130
+    assert "; the same command without --force resumes" in capsys.readouterr().err
 
 
 STOPS = {
