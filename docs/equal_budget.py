@@ -65,8 +65,8 @@ LIMITS = """Thirty minutes cannot tell which network is best after days of train
 the same time, and recurrent ones learn late. A row states what a design gives for this budget on these clips. All
 networks are trained by Adam, mergenet too, whose own protocol has Muon. bit2bit trains on the streams that it restores
 and stands apart. The speed of the machine differed from row to row: one with a slower reference convolution made fewer
-steps than it could. Earlier versions made the rows flornn-1m (windows of eleven frames) and rvrt-1m (higher rates). RVRT
-of published width has windows of 128 x 128 px, because it fills smaller ones to 132 px, which costs as much."""
+steps than it could. Earlier versions made the rows flornn-1m (windows of eleven frames) and rvrt-1m (higher rates). The
+published RVRT has windows of 128 x 128 px, because it fills smaller ones to 132 px, which costs as much."""
 APART = "bit2bit"  # begins the names of networks that learn from the streams they restore
 
 
