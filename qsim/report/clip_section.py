@@ -25,6 +25,8 @@ from qsim.report.panels import (
     fit,
     legend,
     light_name,
+    mosaic_step,
+    of_first,
     stream_panels,
     toned,
     truth_panels,
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 BANDS = ("tab:red", "tab:green", "tab:blue")  # curves of the bands R, G and B
-_PIXELS = 4096  # largest number of a frame in the expected histogram of codes
+_SAMPLES, _PIXELS = 6, 4096  # about the largest numbers of frames, and of pixels of each, in an expected histogram
 
 
 def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
@@ -58,7 +60,7 @@ def clip_section(clip: Clip) -> page.Section:
         panels, largest, speed = truth_panels(clip, frames)
         players += [page.player(panels, left=1), legend(largest)]
         lines.append(motion_line(clip, frames))
-        figures.append(_motion_histogram(speed))
+        figures.append(_motion_histogram(speed, of_first(frames, len(clip))))
     if clip.strengths:
         lines.append(flicker_line(clip))
         figures.append(_strengths(clip))
@@ -90,7 +92,7 @@ def _facts(clip: Clip, frames: range) -> list[page.Fact]:
     """Return the headline numbers of a clip."""
     facts = [page.Fact(" × ".join(map(str, clip.shape)), f"frames × rows × columns of {clip.name}")]
     if clip.has_truth and (mean := motion(clip, frames)[0]) is not None:
-        facts.append(page.Fact(f"{mean:.3g} px", "per frame: mean motion of what moves"))
+        facts.append(page.Fact(f"{mean:.3g} px", f"per frame: mean motion of what moves{of_first(frames, len(clip))}"))
     if (found := stated(clip.meta)) is not None:
         facts.append(page.Fact(f"{found.psnr:.1f} dB", "PSNR of the rendered light itself"))
     return facts
@@ -161,7 +163,7 @@ def defects_words(stream: Stream) -> str:
 
 
 def motion_line(clip: Clip, frames: range) -> str:
-    """Return the motion of a clip as one line."""
+    """Return the motion of a clip as one line; it states `frames` if these are not all."""
     mean, largest = motion(clip, frames)
     moving = (
         "nothing moves"
@@ -171,7 +173,7 @@ def motion_line(clip: Clip, frames: range) -> str:
     if mean is not None and clip.frame_rate >= SLOWEST:  # frames of a bit-depth study
         speed = np.stack([np.hypot(*clip.flow(t)) for t in frames])
         moving += f" ({moving_mean(speed, CODE_PLANES):.3g} px per {CODE_BITS}-bit frame of {CODE_PLANES} planes)"
-    return f"Motion: {moving}; 99.9 % of all pixels at most {largest:.3g} px/frame"
+    return f"Motion{of_first(frames, len(clip))}: {moving}; 99.9 % of all pixels at most {largest:.3g} px/frame"
 
 
 def error_lines(meta: dict[str, Any]) -> list[str]:
@@ -209,7 +211,7 @@ def code_histogram(clip: Clip, stream: Stream) -> Markup:
     axes, save = page.axes("code", "share of pixels")
     few = levels <= 64
     axes.bar(np.arange(levels), drawn, width=0.8 if few else 1.0, color="tab:blue", alpha=0.6, label="drawn")
-    words = f"codes of {stream.name}: drawn"
+    words = f"codes of {stream.name}{of_first(range(count), len(stream))}: drawn"
     missing = unexpected(clip, stream)
     if missing is None:
         try:
@@ -249,16 +251,21 @@ def unexpected(clip: Clip, stream: Stream) -> str | None:
 def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64]:
     """Return the mean probability of each code over every n-th pixel of some frames, float64 [2^bits].
 
-    It includes the maps of defects. Raise `ValueError` or `OSError` if a measured map has changed or is missing.
+    Under flicker all `count` frames are taken, so that none of its phases is left out; a mosaic keeps all its colours.
+    The maps of defects are included. Raise `ValueError` or `OSError` if a measured map has changed or is missing.
     """
-    chosen = np.unique(np.linspace(0, count - 1, min(count, 6)).astype(int))
+    samples = count if clip.strengths else min(count, _SAMPLES)
+    chosen = np.unique(np.linspace(0, count - 1, samples).astype(int))
     height, width = clip.shape[1:]
-    step = max(1, int(np.sqrt(height * width / _PIXELS)))
+    share = max(1.0, len(chosen) / _SAMPLES)  # more frames, fewer pixels of each
+    step = mosaic_step(max(1, int(np.sqrt(height * width * share / _PIXELS))), stream.colour_filter)
     blurred = bool(stream.meta.get("diffraction", False))
-    light = [clip_photons(clip, int(t), stream.photons_factor, diffraction=blurred) for t in chosen]
-    if stream.colour_filter is not None:
-        light = [stream.colour_filter.mosaic(each, stream.sensor.efficiency) for each in light]
-    light = [each[::step, ::step] for each in light]
+    light = []
+    for t in chosen:
+        each = clip_photons(clip, int(t), stream.photons_factor, diffraction=blurred)
+        if stream.colour_filter is not None:
+            each = stream.colour_filter.mosaic(each, stream.sensor.efficiency)
+        light.append(each[::step, ::step].copy())  # not a view, which would keep the whole frame in memory
     sensor, maps = stream.sensor, fixed_pattern.PERFECT
     if "defects" in stream.meta:
         found = defect_table.from_dict(stream.meta["defects"], f"{stream.name}: defects")
@@ -270,12 +277,12 @@ def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64
     return mean
 
 
-def _motion_histogram(speed: NDArray[np.floating]) -> Markup:
+def _motion_histogram(speed: NDArray[np.floating], which: str) -> Markup:
     axes, save = page.axes("motion [px/frame]", "share of pixels")
     known = speed[np.isfinite(speed)]
     axes.hist(known, bins=48, weights=np.full(known.size, 1 / max(known.size, 1)), color="tab:blue")
     axes.set_yscale("log")
-    return save("motion between successive frames, all pixels")
+    return save(f"motion between successive frames, all pixels{which}")
 
 
 def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> Markup:
@@ -287,7 +294,8 @@ def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> Markup:
         shown = {"color": paint} if clip.bands is None else {"color": paint, "histtype": "step"}
         axes.hist(values.ravel(), bins=64, weights=weights, **shown)
     axes.set_yscale("log")
-    return save(f"light of the {light_name(clip)}, all pixels" + ("" if clip.bands is None else ", each band"))
+    which = of_first(range(len(truth)), len(clip))
+    return save(f"light of the {light_name(clip)}, all pixels{which}" + ("" if clip.bands is None else ", each band"))
 
 
 def _strengths(clip: Clip) -> Markup:

@@ -5,6 +5,8 @@ All pictures of one player have one white and one tone curve. A code is shown as
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +28,8 @@ from qsim.sensor.sensor import Sensor
 if TYPE_CHECKING:
     from markupsafe import Markup
 
+    from qsim.sensor.colour_filter import ColourFilter
+
 FRAMES = 48  # largest number in a player
 WIDTH = 512  # columns of a panel; wider pictures are reduced by a whole factor
 _BITS = 8  # of codes that are shown as light; deeper ones are shown as they are
@@ -43,14 +47,28 @@ def chosen_frames(count: int, height: int, width: int) -> range:
     return range(min(count, FRAMES, max(page.MAX_STRIP // rows, 1)))
 
 
-def fit(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return every n-th row and column of [T, H, W] or [T, H, W, 3], so that a panel has at most WIDTH columns."""
-    step = _step(frames.shape[2])
+def of_first(frames: range, count: int) -> str:
+    """Return " in the first 48 of 132 frames", behind what numbers of `frames` describe; "" if these are all."""
+    return "" if len(frames) == count else f" in the first {len(frames)} of {count} frames"
+
+
+def fit(frames: NDArray[np.uint8], filters: ColourFilter | None = None) -> NDArray[np.uint8]:
+    """Return every n-th row and column of [T, H, W] or [T, H, W, 3], so that a panel has at most WIDTH columns.
+
+    Of a mosaic with these filters, n leaves pixels of every colour.
+    """
+    step = mosaic_step(_step(frames.shape[2]), filters)
     return frames[:, ::step, ::step]
 
 
 def _step(width: int) -> int:
     return -(-width // WIDTH)
+
+
+def mosaic_step(least: int, filters: ColourFilter | None) -> int:
+    """Return the least step from `least` on that takes pixels from every place of a tile of filters alike."""
+    tile = (1, 1) if filters is None else filters.tile
+    return next(step for step in itertools.count(least) if all(math.gcd(step, side) == 1 for side in tile))
 
 
 def toned(light: Photons, white: float) -> NDArray[np.uint8]:
@@ -97,14 +115,15 @@ def stream_panels(stream: Stream, frames: range, truth: Photons | None = None) -
     shown = codes[frames.start - first : frames.stop - first]
     names = f"codes, {stream.bits} bit ({stream.name})", f"mean of {colour.AVERAGE} frames"
     sensor, left = good_pixels.of_stream(stream.sensor, stream.meta)
+    filters = stream.colour_filter
     one, many = (_inverse(stream, sensor, samples) for samples in (1, min(colour.AVERAGE, len(stream))))
     if one is None or many is None:
         shown_codes = colour.code_levels(shown, stream.bits)
         return [
-            page.Panel(names[0], fit(shown_codes)),
-            page.Panel(names[1], fit(colour.tone(averages, colour.peak(averages)))),
+            page.Panel(names[0], fit(shown_codes, filters)),
+            page.Panel(names[1], fit(colour.tone(averages, colour.peak(averages)), filters)),
         ]
-    light, average, filters = one(shown), many(averages), stream.colour_filter
+    light, average = one(shown), many(averages)
     mosaic, picture = truth, average
     if filters is not None:
         mosaic = None if truth is None else filters.mosaic(truth, stream.sensor.efficiency)
@@ -115,10 +134,11 @@ def stream_panels(stream: Stream, frames: range, truth: Photons | None = None) -
             truth = mosaic
     white = colour.peak(picture if truth is None else truth)
     after = f"; {left}" if left else ""
+    behind = filters if picture.ndim == 3 else None  # a demosaiced picture is no mosaic
     brightest = float(one(np.array([2.0**stream.bits - 1]))[0])
     return [
-        page.Panel(names[0] + after, fit(colour.tone(light, min(white, brightest))), score(light, mosaic)),
-        page.Panel(names[1] + after, fit(toned(picture, white)), score(picture, truth)),
+        page.Panel(names[0] + after, fit(colour.tone(light, min(white, brightest)), filters), score(light, mosaic)),
+        page.Panel(names[1] + after, fit(toned(picture, white), behind), score(picture, truth)),
     ]
 
 

@@ -34,6 +34,7 @@ from qsim.report.panels import (
     fit,
     legend,
     light_name,
+    of_first,
     score,
     stream_panels,
     toned,
@@ -208,14 +209,15 @@ def restored_section(path: Path) -> page.Section:
             panels += overlays[1:]  # the first is the light again
             wheel = legend(largest)
     lines.append(f"White of the pictures: {white:.3g} photons.")
-    found = f" at {own.score} PSNR" if own.score else ""
+    which = of_first(frames, len(restored))
+    found = f" at {own.score} PSNR{which}" if own.score else ""
     seen = (
         f"{clip.name}, seen as {stream.name},"
         if truth is not None and clip is not None and stream is not None
         else path.stem
     )
     story = f"{seen} is restored by {name}{found}."
-    facts = [page.Fact(own.score, f"PSNR of {path.stem}")] if own.score else []
+    facts = [page.Fact(own.score, f"PSNR of {path.stem}{which}")] if own.score else []
     player = page.player(panels, left=len(panels) - 1 if len(panels) < 4 else 3, right=1 if len(panels) > 1 else 0)
     return page.section(f"Restored: {path.stem}", player, page.bullets(lines), wheel, story=story, facts=facts)
 

@@ -61,26 +61,30 @@ _SUFFIXES = (
 def training_section(path: Path) -> page.Section:
     """Return the learning curve: PSNR of the validation clips against minutes, with the weights that were kept."""
     history = files.read_json(path)["history"]
-    minutes, scores = ([entry[key] for entry in history] for key in ("elapsed", "psnr_matched"))
-    minutes = [seconds / 60 for seconds in minutes]
+    name, steps = path.parent.name, f"{history[-1]['step']} steps in {history[-1]['elapsed'] / 60:.1f} minutes"
+    known = [(entry["elapsed"] / 60, entry["psnr_matched"]) for entry in history if _is_number(entry["psnr_matched"])]
+    if not known:
+        story = f"Training {name}: no validation has a finite score."
+        return page.section(f"Training: {name}", page.text(f"{steps}; no validation has a finite score."), story=story)
+    minutes, scores = zip(*known, strict=True)
     axes, save = page.axes("minutes of training", "validation PSNR, matched [dB]")
     axes.plot(minutes, scores, ".-")
-    best = max(range(len(scores)), key=lambda i: scores[i] if _is_number(scores[i]) else float("-inf"))
+    best, last = max(range(len(scores)), key=scores.__getitem__), history[-1]["psnr_matched"]
     axes.plot(minutes[best], scores[best], "o", color="tab:orange", label="best, kept")
     axes.legend()
-    name = path.parent.name
     story = f"Training {name} reached {scores[best]:.2f} dB on the validation clips after {minutes[best]:.1f} minutes."
-    story += _drop_after(scores[best], scores[-1])
-    words = (
-        f"{history[-1]['step']} steps in {minutes[-1]:.1f} minutes. The weights of the best validation are kept "
-        f"({scores[best]:.2f} dB); the last one has {scores[-1]:.2f} dB."
+    story += _drop_after(scores[best], last)
+    words = f"{steps}. The weights of the best validation are kept ({scores[best]:.2f} dB); the last one has " + (
+        f"{last:.2f} dB." if _is_number(last) else "no finite score."
     )
     facts = [page.Fact(f"{scores[best]:.2f} dB", f"best validation of {name}")]
     return page.section(f"Training: {name}", save(words), story=story, facts=facts)
 
 
-def _drop_after(best: float, last: float) -> str:
-    """Return a sentence if a curve [dB] ends below its best by more than what two digits show, else nothing."""
+def _drop_after(best: float, last: float | None) -> str:
+    """Return a sentence if a curve [dB] ends without a score, or below its best in two digits; else nothing."""
+    if last is None:
+        return " The last validation has no finite score."
     if not last < best - 0.005:
         return ""
     return f" It then got worse: the last validation is {best - last:.2f} dB below the best, whose weights are kept."

@@ -1,5 +1,6 @@
 """Tests the section of a clip: light, motion, codes with their exact distribution, modelled effects, error."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,12 @@ from stats import mixture_p_value
 
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
 from qsim.clip.photons import clip_photons
 from qsim.clip.rows import Rows
 from qsim.clip.sensing import Sensing, sense
+from qsim.clip.writer import ClipWriter
+from qsim.optics.radiometry import RGB
 from qsim.report import clip_section, report
 
 DEVICES = {
@@ -118,3 +122,51 @@ def test_expected_histogram_is_the_mean_of_the_exact_distribution(tmp_path):
     exact = stream.sensor.pmf(light, stream.exposure).mean(axis=(0, 1, 2))
     np.testing.assert_allclose(expected, exact, atol=2e-3)  # every n-th pixel of light that falls off as cos^4
     assert expected.sum() == pytest.approx(1)
+
+
+def test_expected_codes_of_a_mosaic_hold_all_its_colours(tmp_path):
+    """Every second pixel of a tile of 2 x 2 would be red, the brightest of these bands."""
+    radiance = np.broadcast_to(np.array([3.0, 1.0, 0.3])[:, None, None], (2, 3, 128, 128))
+    stream = write_clip(tmp_path / "c", radiance=radiance, bands=list(RGB)).sense(bits=3, ppp=3.25, colour="rggb")
+    clip = Clip.open(tmp_path / "c")
+    light = stream.colour_filter.mosaic(clip_photons(clip, 0, stream.photons_factor), stream.sensor.efficiency)
+    exact = stream.sensor.pmf(light, stream.exposure).mean(axis=(0, 1))
+    np.testing.assert_allclose(clip_section.expected_codes(clip, stream, 2), exact, atol=0.01)
+
+
+def test_expected_codes_under_flicker_hold_all_its_phases(tmp_path):
+    """A lamp of half the frame rate: frames 0, 4, ... 20 alone would all be dark."""
+    strength = [0.5 + t % 2 for t in range(21)]
+    flicker = {"light0": {"kind": "PulseWidth", "frequency": 1000.0, "strength": strength}}
+    radiance = np.tile(2 * np.array(strength)[:, None, None], (1, 24, 33))
+    clip = write_clip(tmp_path / "c", radiance=radiance, relative=True, flicker=flicker)
+    stream = clip.sense(bits=3, ppp=3.25)
+    light = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(21)])
+    exact = stream.sensor.pmf(light, stream.exposure).mean(axis=(0, 1, 2))
+    np.testing.assert_allclose(clip_section.expected_codes(clip, stream, 21), exact, atol=1e-9)
+
+
+def test_numbers_of_the_first_frames_are_not_those_of_the_clip(tmp_path):
+    """The square moves after frame 50 of 60, and a page reads 48 of them."""
+    size = (8, 24)
+    meta = {"shape": [60, *size], "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE}
+    with ClipWriter(tmp_path / "late", meta) as writer:
+        for t in range(60):
+            left = 2 + max(t - 50, 0)
+            radiance, flow = np.full(size, 0.1, np.float32), np.zeros((2, *size), np.float32)
+            radiance[2:6, left : left + 4] = 1.0
+            flow[0, 2:6, left : left + 4] = t >= 50
+            writer.add(t, radiance, truth={"flow": flow, "flow_back": -flow, "valid": np.ones(size, bool)})
+    stream = Clip.open(tmp_path / "late").sense(bits=3, ppp=3.25, name="mine")
+    body, which = clip_section.clip_section(Clip.open(tmp_path / "late")).body, "in the first 48 of 60"
+    assert f"Motion {which} frames: nothing moves" in body
+    assert body.count("nothing moves") == 1
+    assert f"motion between successive frames, all pixels {which} frames" in body
+    assert f"light of the recorded video, all pixels {which} frames" in body
+    assert f"codes of mine {which} frames: drawn" in body
+    about = {"format": "quiver-restored-1", "method": "moment", "seconds_per_frame": 0.1, "source": str(stream.path)}
+    np.save(tmp_path / "v.npy", np.full(stream.shape, 3.25, np.float32))
+    (tmp_path / "v.json").write_text(json.dumps(about))
+    section = report.restored_section(tmp_path / "v.json")
+    assert section.story.endswith(f"PSNR {which} frames.")
+    assert section.facts[0].what == f"PSNR of v {which} frames"

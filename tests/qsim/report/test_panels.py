@@ -15,6 +15,7 @@ from qsim.clip.manifest import RELATIVE
 from qsim.clip.photons import clip_photons
 from qsim.clip.writer import ClipWriter
 from qsim.report import panels, views
+from qsim.sensor.colour_filter import MASKS, ColourFilter
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +161,23 @@ def test_a_stream_behind_one_filter_is_shown_in_grey(tmp_path, name):
     assert mean.score.endswith("dB")
     average = views.open_source(stream.path.with_suffix(".json")).views["average"]
     assert ("demosaiced" in average.declared) == (name == "rggb")
+
+
+def test_a_wide_mosaic_keeps_all_its_colours(tmp_path):
+    """Every second pixel of a tile of 2 x 2 is red, so 520 columns are reduced by 3; a demosaiced picture by 2."""
+    clip = colour_clip(tmp_path / "c", frames=2, height=8, width=520)
+    stream = clip.sense("spad512s", bits=1, ppp=0.4, colour="rggb")
+    codes, mean = panels.stream_panels(stream, range(2))
+    assert codes.frames.shape == (2, 3, 174)
+    assert mean.frames.shape == (2, 4, 260, 3)
+    for name in ("rggb", "quad"):
+        filters = ColourFilter(MASKS[name])
+        rows, columns = filters.tile
+        colours = np.array([[ord(letter) for letter in row] for row in filters.mask], np.uint8)
+        mosaic = np.tile(colours, (1, 24 // rows, 528 // columns))
+        seen = panels.fit(mosaic, filters)
+        for letter in b"RGB":
+            assert (seen == letter).mean() == pytest.approx((mosaic == letter).mean()), (name, chr(letter))
 
 
 def test_tall_pictures_show_as_many_frames_as_browsers_draw():

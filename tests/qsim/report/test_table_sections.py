@@ -116,6 +116,18 @@ def test_a_page_says_that_a_curve_got_worse(tmp_path, last, told):
     assert ("got worse" in training_section(path).story) == told
 
 
+@pytest.mark.parametrize("scores", [(20.0, 22.0, None), (20.0, None, 22.0), (None,)])
+def test_validations_without_a_finite_score_are_left_out_of_the_curve(tmp_path, scores):
+    """history.json holds null for them; the page says so where the last or every one is such."""
+    entries = [{"step": i, "elapsed": 60.0 * i, "psnr_matched": psnr} for i, psnr in enumerate(scores)]
+    path = tmp_path / "history.json"
+    path.write_text(json.dumps({"history": entries}))
+    section = training_section(path)
+    assert ("reached 22.00 dB" in section.story) == (22.0 in scores)
+    assert ("last validation has no finite score" in section.story) == (scores == (20.0, 22.0, None))
+    assert ("no validation has a finite score" in section.body) == (scores == (None,))
+
+
 def test_headings_have_units(tmp_path):
     row = {"model": "planes", "bits": 3, "blur_error": 0.5, "loss_of_prediction_db": 0.25, "new_key": 1}
     (tmp_path / "tradeoff.json").write_text(
