@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy import ndarray as Array
@@ -20,9 +20,10 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.calibration.frame_statistics import FrameStatistics, measure, measure_sums
 from qsim.calibration.results import Calibration
+from qsim.clip.stream import Stream
 from qsim.figures import figure_png, new_figure
 from qsim.files import load_array
-from qsim.formats import importing
+from qsim.formats import importing, photon_times
 from qsim.formats.mat_files import mat_array
 from qsim.formats.recording import Hints
 from qsim.sensor.counting import CountingSPAD
@@ -31,6 +32,7 @@ from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 
 _BLOCK_BYTES = 1 << 25
+_MOST_PLANES = 255  # of photon times: all are held at once
 
 
 def read_stack(
@@ -43,29 +45,36 @@ def read_stack(
     planes: int | None = None,
     variable: str | None = None,
 ) -> FrameStatistics:
-    """Return the statistics of the frames in a file: `.npy` of integer values, TIFF, or any recording of `convert`.
+    """Return the statistics of the frames in a file: `.npy` of integer values, a stream, or any recording of `convert`.
 
     `exposure` in seconds, `photons` per pixel and exposure. With `width` an `.npy` is a photon cube of packed planes.
     With `planes` every value sums this number of binary planes. `variable` names an array of a `.mat`. `ValueError` or
     `FileNotFoundError` naming the file.
     """
     if planes is None:
-        blocks = _blocks(path, bits, width, variable)
+        blocks = _blocks(path, bits, exposure, None, width, variable)
         return measure(blocks, bits=bits, exposure=exposure, photons=photons, name=str(path))
-    blocks = _blocks(path, planes.bit_length(), width, variable)
+    blocks = _blocks(path, planes.bit_length(), exposure, planes, width, variable)
     return measure_sums(blocks, planes=planes, exposure=exposure, photons=photons, name=str(path))
 
 
-def _blocks(path: Path, bits: int, width: int | None, variable: str | None) -> Iterator[Array]:
+def _blocks(
+    path: Path, bits: int, exposure: float, planes: int | None, width: int | None, variable: str | None
+) -> Iterator[Array]:
     """Return the frames of a file in blocks [t, H, W]."""
     if variable is not None and path.suffix != ".mat" and not path.is_dir():
         raise ValueError(f"{path}: --variable names an array of a .mat file; leave it out")
-    if path.suffix == ".npy" and width is None:
-        return _array_blocks(read_counts(path))
+    stream = stream_of(path)
+    if stream is not None and width not in (None, stream.shape[2]):
+        raise ValueError(f"{path}: is a stream of {stream.shape[2]} pixels per row, not {width}; leave --width out")
+    if stream is not None or (path.suffix == ".npy" and width is None):
+        return _array_blocks(read_counts(path, bits=bits))
     if path.suffix == ".mat":
         if width is not None:
             raise ValueError(f"{path}: --width acts on packed planes, and a .mat has one value per pixel; leave it out")
         return _array_blocks(mat_array(path, variable))
+    if path.suffix.lower() == ".npz" and width is None:
+        return _array_blocks(_photon_codes(path, bits, exposure, planes))
     layout = "cube" if path.suffix == ".npy" else None  # --width states it: dark planes could be several layouts
     hints = Hints(layout=layout, bits=min(bits, 16), width=width, variable=variable)
     recording = importing.read(path, hints, compared=("bits",))
@@ -74,15 +83,44 @@ def _blocks(path: Path, bits: int, width: int | None, variable: str | None) -> I
     return (block for _, block in importing.blocks(recording))
 
 
-def read_counts(path: Path, variable: str | None = None) -> Array:
-    """Return the frames [T, H, W] of an `.npy`, mapped, or of a `.mat`.
+def stream_of(path: Path) -> Stream | None:
+    """Return the stream whose codes or description a file holds; None for other files."""
+    if path.suffix not in (".npy", ".json"):
+        return None
+    side = path.with_suffix(".json")
+    if not side.is_file() or "ppp_factor" not in files.read_json(side):
+        return None
+    return Stream.open(side)
 
-    `ValueError` or `FileNotFoundError` naming the file.
+
+def _photon_codes(path: Path, bits: int, exposure: float, planes: int | None) -> Array:
+    """Return the counts [T, H, W] of photon times; for 1 bit and sums of planes those of a clocked SPAD."""
+    photons = photon_times.read(path)
+    stated = photons.exposure / (planes or 1)
+    if not math.isclose(exposure, stated, rel_tol=1e-3):  # typed by hand
+        raise ValueError(f"{path}: an exposure of {exposure:g} s; the photon times state {stated:g} s, give that")
+    if planes is None and bits > 1:
+        return np.asarray(np.minimum(photons.counts(), (1 << bits) - 1))
+    parts = planes or 1
+    if parts > _MOST_PLANES:
+        raise ValueError(f"{path}: sums of {parts} planes; of photon times sums of at most {_MOST_PLANES} are made")
+    return np.asarray(photons.clocked(parts).reshape(-1, parts, *photons.shape[1:]).sum(axis=1))
+
+
+def read_counts(path: Path, variable: str | None = None, bits: int | None = None) -> Array:
+    """Return the frames [T, H, W] of an `.npy`, mapped, of a stream, read when they are used, or of a `.mat`.
+
+    `ValueError` or `FileNotFoundError` naming the file, also for a stream of other `bits`.
     """
     if path.suffix == ".mat":
         return mat_array(path, variable)
     if variable is not None:
         raise ValueError(f"{path}: --variable names an array of a .mat file; leave it out")
+    stream = stream_of(path)
+    if stream is not None:
+        if bits not in (None, stream.bits):
+            raise ValueError(f"{path}: is a stream of {stream.bits} bits per code, not {bits}; give what it states")
+        return cast(Array, stream.codes)
     array = load_array(path)
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or array.size == 0:

@@ -83,13 +83,14 @@ def _run_calibrate(args: argparse.Namespace) -> int:
 
 def _check_outputs(args: argparse.Namespace, model: str) -> None:
     """Raise an `OSError` if a file to write exists without --force, or is an input."""
-    from qsim.calibration.sensor_file import beside
+    from qsim.calibration.sensor_file import beside, stream_of
 
     values, plot, dark_map = beside(args.output)
-    stacks = [*args.dark, *args.flat, *([args.static] if args.static else [])]
+    inputs = [Path(words[0]) for words in [*args.dark, *args.flat, *([args.static] if args.static else [])]]
+    inputs += [path.with_suffix(end) for path in inputs if stream_of(path) is not None for end in (".npy", ".json")]
     for path in (args.output, values, plot, *([dark_map] if model == "spad" and args.dark else [])):
         places = (path, *path.resolve().parents) if path.exists() else ()
-        for given in (Path(words[0]) for words in stacks):
+        for given in inputs:
             if given.exists() and any(place.samefile(given) for place in places):
                 raise FileExistsError(f"{path}: would replace a file of the input {given}; name another with -o")
         refuse_existing(path, args.force)
@@ -154,7 +155,7 @@ def _static(args: argparse.Namespace, bits: int) -> Any:
     from qsim.calibration.sensor_file import read_counts
 
     path = Path(args.static[0])
-    counts = read_counts(path, args.variable)
+    counts = read_counts(path, args.variable, bits)
     return calibrate_static(
         counts, bits=bits, exposure=_number(args.static[1]), paralyzable=args.paralyzable, name=str(path)
     )

@@ -2,10 +2,11 @@
 
     codes within the span -> mean code -> exact inverse response -> photons per clip frame, against the sharp truth
 
-A stream of short codes averages many of them, one of long codes few, and all see the same motion. Light is compared in
-the clip's own unit, so streams at other light levels are compared, too. A first row states the error of the light
-itself: the mean of the span without noise, which is what blur leaves. Of a stream with defects the response is that of
-its good pixels; remarks name what it leaves out.
+A stream of short codes averages many of them, one of long codes few, and all see the same motion. The truth is that of
+the clip frame in the middle of the averaged codes, of an even number the later of two. Light is compared in the clip's
+own unit, so streams at other light levels are compared, too. A first row states the error of the light itself: the
+mean of the span without noise, which is what blur leaves. Of a stream with defects the response is that of its good
+pixels; remarks name what it leaves out.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Readouts:
 
     clip: str
     span: float  # s, as asked
-    instants: tuple[int, ...]  # clip frames that were compared
+    instants: tuple[int, ...]  # clip frames in the middle of each span
     rows: tuple[ReadoutRow, ...]
     remarks: tuple[str, ...] = ()  # defects of streams that estimates do not invert
 
@@ -77,22 +78,25 @@ def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) ->
             f"{clip.path}: a span of {seconds:.4g} s; {where} {end} frames of {frame:.4g} s: give a span between"
         )
     centres = tuple(range(window // 2, end - window + window // 2 + 1, window))
-    truth = np.stack([clip_photons(clip, t, sharp=True) for t in centres])
     peak = WHITE_PER_MEAN * float(np.mean([clip_photons(clip, t).mean() for t in range(len(clip))]))
 
-    def score(found: Array) -> float:
+    def score(found: Array, middles: Sequence[int]) -> float:
+        truth = np.stack([clip_photons(clip, t, sharp=True) for t in middles])
         return psnr(peak, rms(found - truth))
 
     blurred = np.stack([_light(clip, t - window // 2, window) for t in centres])
-    rows = [ReadoutRow("", "light", None, window, window * frame, None, score(blurred), None)]
+    rows = [ReadoutRow("", "light", None, window, window * frame, None, score(blurred, centres), None)]
     remarks: list[str] = []
     for stream in streams:
-        codes = max(1, round(window / _frames_per_code(stream)))
+        per_code = _frames_per_code(stream)
+        codes = max(1, round(window / per_code))
         sensor, left = good_pixels.of_stream(stream.sensor, stream.meta)
         remarks += [f"{stream.name}: {left}"] if left else []
         response = sensor.response(stream.exposure, _POINTS)
-        found = np.stack([_estimate(stream, response, t, codes) for t in centres])
-        rows.append(_row(stream, codes, codes * _frames_per_code(stream) * frame, score(found)))
+        firsts = [_first_code(stream, t, codes) for t in centres]
+        found = np.stack([_estimate(stream, response, first, codes) for first in firsts])
+        middles = [first * per_code + codes * per_code // 2 for first in firsts]
+        rows.append(_row(stream, codes, codes * per_code * frame, score(found, middles)))
     return Readouts(clip.name, seconds, centres, tuple(rows), tuple(remarks))
 
 
@@ -105,13 +109,16 @@ def _light(clip: Clip, first: int, window: int) -> Array:
     return np.mean([clip_photons(clip, t) for t in range(first, first + window)], axis=0)
 
 
-def _estimate(stream: Stream, response: Response, centre: int, codes: int) -> Array:
-    """Return photons per clip frame, float64 [H, W], from the codes around a clip frame, at the clip's own light."""
-    per_code = _frames_per_code(stream)
-    first = round((centre + 0.5) / per_code - codes / 2)
-    first = min(max(first, 0), len(stream) - codes)
+def _first_code(stream: Stream, centre: int, codes: int) -> int:
+    """Return the first of the `codes` codes around a clip frame."""
+    first = round((centre + 0.5) / _frames_per_code(stream) - codes / 2)
+    return min(max(first, 0), len(stream) - codes)
+
+
+def _estimate(stream: Stream, response: Response, first: int, codes: int) -> Array:
+    """Return photons per clip frame, float64 [H, W], from codes first ... first + codes - 1, in the clip's light."""
     mean = stream.codes(first, first + codes).mean(axis=0)
-    return np.asarray(response.invert(mean, codes) / (per_code * stream.photons_factor))
+    return np.asarray(response.invert(mean, codes) / (_frames_per_code(stream) * stream.photons_factor))
 
 
 def _row(stream: Stream, codes: int, seconds: float, score: float) -> ReadoutRow:

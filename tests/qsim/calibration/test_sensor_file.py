@@ -2,12 +2,17 @@
 
 import numpy as np
 import pytest
+from clips import write_clip
 from synthetic import SPADCase, statistics_of
 
-from qsim.calibration.sensor_file import read_stack, sensor_of, to_toml, write
+from qsim.calibration.sensor_file import read_counts, read_stack, sensor_of, to_toml, write
 from qsim.calibration.spad import calibrate_spad
+from qsim.formats import photon_times
 from qsim.sensor import devices
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD
 
 
 def test_files_of_a_calibration_load_as_a_device(tmp_path):
@@ -33,6 +38,62 @@ def test_frames_are_read_from_npy_and_from_a_photon_cube(tmp_path):
     assert np.array_equal(one.total, two.total)
     with pytest.raises(FileNotFoundError, match=r"nothing\.npy"):
         read_stack(tmp_path / "nothing.npy", bits=1, exposure=1e-5, photons=None)
+
+
+def test_the_packed_codes_of_a_stream_are_unpacked(tmp_path):
+    """Every byte of a row of 12 bits per pixel was taken as a pixel, without a word."""
+    clip = write_clip(tmp_path / "c", frames=4, height=5, width=11)
+    stream = clip.sense(QIS(0.6, 100.0, 5.0, 12, 0.4), ppp=900.0, name="camera_900.5ppp")
+    side = stream.path.with_suffix(".json")
+    for path in (stream.path, side):
+        found = read_stack(path, bits=12, exposure=5e-4, photons=None)
+        assert np.array_equal(found.total, stream.codes().sum(axis=0, dtype=float))
+        assert np.array_equal(found.last, stream.codes()[-1])
+        assert np.array_equal(read_counts(path), stream.codes())
+        for bits in (8, 13):
+            with pytest.raises(ValueError, match=f"is a stream of 12 bits per code, not {bits}; give what it states"):
+                read_stack(path, bits=bits, exposure=5e-4, photons=None)
+            with pytest.raises(ValueError, match="is a stream of 12 bits"):
+                read_counts(path, bits=bits)
+
+
+def test_planes_of_a_stream_need_no_width(tmp_path):
+    """Packed planes were taken as bytes, or read with the width; sums of planes are those that the stream states."""
+    clip = write_clip(tmp_path / "c", frames=9, height=5, width=11)
+    one = clip.sense(BinarySPAD(0.5, 200.0), ppp=0.7, name="one")
+    sums = clip.sense(BinarySPAD(0.5, 200.0, 2), ppp=2.1, group=True, name="sums")
+    for width in (None, 11):
+        found = read_stack(one.path, bits=1, exposure=5e-4, photons=None, width=width)
+        assert np.array_equal(found.total, one.codes().sum(axis=0, dtype=float))
+    with pytest.raises(ValueError, match="is a stream of 11 pixels per row, not 12; leave --width out"):
+        read_stack(one.path, bits=1, exposure=5e-4, photons=None, width=12)
+    found = read_stack(sums.path, bits=1, exposure=5e-4, photons=None, planes=3)
+    assert (found.frames, found.mean) == (9, pytest.approx(sums.codes().mean() / 3))
+
+
+def test_photon_times_are_calibrated_as_the_counts_of_their_pixels(tmp_path):
+    """Sums of clocked planes were read, which have the dead time of the clock; the exposure was not compared."""
+    clip = write_clip(tmp_path / "c", frames=4, height=6, width=7)
+    stream = clip.sense(CountingSPAD(0.5, 500.0, 2e-5, 8), ppp=40.0, name="p", follow=True)
+    path = tmp_path / "p.npz"
+    photon_times.write(stream, path)
+    found = read_stack(path, bits=8, exposure=5e-4, photons=None)
+    assert np.array_equal(found.total, stream.codes().sum(axis=0, dtype=float))
+    few = read_stack(path, bits=3, exposure=5e-4, photons=None)
+    assert np.array_equal(few.total, np.minimum(stream.codes(), 7).sum(axis=0, dtype=float))
+    planes = photon_times.read(path).clocked(50)
+    sums = read_stack(path, bits=1, exposure=1e-5, photons=None, planes=50)
+    assert (sums.frames, sums.mean) == (200, pytest.approx(planes.mean()))
+    fired = read_stack(path, bits=1, exposure=5e-4, photons=None)
+    assert np.array_equal(fired.total, photon_times.read(path).clocked(1).sum(axis=0, dtype=float))
+    for seconds, more, message in (
+        (1e-3, {"bits": 8}, "an exposure of 0.001 s; the photon times state 0.0005 s, give that"),
+        (5e-4, {"bits": 1, "planes": 50}, "an exposure of 0.0005 s; the photon times state 1e-05 s, give that"),
+        (5e-4 / 300, {"bits": 1, "planes": 300}, "of photon times sums of at most 255 are made"),
+        (5e-4, {"bits": 1, "width": 7}, "--width changes nothing for photon times; leave it out"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_stack(path, exposure=seconds, photons=None, **more)
 
 
 def test_parameters_that_were_not_measured_are_named():

@@ -12,6 +12,7 @@ from sensor_files import sensor_file
 
 from qsim.cli.program import main
 from qsim.clip.photons import clip_photons
+from qsim.clip.sensing import write_stream
 from qsim.sensor.qis import QIS
 from qsim.sensor.spike import SpikeCamera
 from qsim.studies.readouts import compare
@@ -41,6 +42,25 @@ def test_the_light_of_a_span_is_its_mean_and_a_sensor_without_noise_finds_it(tmp
         assert abs(error / (blur + shot) - 1) < 6 * np.sqrt(2 / truth.size) + 0.1
     assert (each.ppp, four.ppp) == (pytest.approx(600.0), pytest.approx(150.0))
     assert each.megabytes_per_second == pytest.approx(9 * 7 * 9 * 2000 / 8e6)
+
+
+def test_each_stream_is_scored_at_the_middle_of_its_own_codes(tmp_path):
+    """A square moves on while codes of three frames, without noise, begin and end elsewhere than the span of seven."""
+    light = np.full((21, 12, 33), 6.0)
+    for t in range(21):
+        light[t, 3:9, 4 + t : 10 + t] = 60.0
+    clip = write_clip(tmp_path / "c", radiance=light, relative=True)
+    for name, per_code in (("three", 3), ("seven", 7)):
+        codes = light.reshape(-1, per_code, 12, 33).sum(axis=1).astype(np.uint16)
+        meta = {"shape": list(codes.shape), "ppp_factor": 1.0, "planes_per_code": per_code}
+        write_stream(clip, name, codes, EXACT, meta | {"exposure": 5e-4 * per_code, "frame_rate": 2000 / per_code})
+    found = compare(clip)
+    assert found.instants == (3, 10, 17)
+    scores = {row.stream: row.psnr_db for row in found.rows}
+    for name, frames, starts in (("", 7, (0, 7, 14)), ("seven", 7, (0, 7, 14)), ("three", 6, (0, 6, 15))):
+        error = [light[t : t + frames].mean(axis=0) - light[t + frames // 2] for t in starts]
+        expected = 20 * np.log10(2.5 * light.mean() / np.sqrt(np.mean(np.square(error))))
+        assert scores[name] == pytest.approx(expected, abs=0.01), name
 
 
 @pytest.mark.parametrize("span", [1, 2, 5, 6, 11])
