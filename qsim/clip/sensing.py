@@ -207,6 +207,14 @@ def _check_planes(sensor: Sensor, sensing: Sensing, clip: ClipFolder) -> None:
         raise ValueError(f"{clip.name}: slices of one exposure need a clip whose shutter is open all the time")
 
 
+def followed(clip: ClipFolder, sensing: Sensing, draw: Draw) -> tuple[Draw, Effects | None]:
+    """Return the draw, photon by photon where needed or asked for, and the error of the closed form; None if exact."""
+    missed = draw.missed(clip) or (Effects(0.0, 0.0, 0.0) if sensing.follow else None)
+    if missed is None or not (sensing.follow or missed.largest > TOLERANCE):
+        return draw, missed
+    return dataclasses.replace(draw, followed=missed), missed
+
+
 def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
     """Return the json of the stream of a draw, without the fields of the written file (checksums, versions)."""
     _, height, width = clip.shape
@@ -253,7 +261,7 @@ def sense(
     A stream of this name is kept if its settings are the same; `FileExistsError` for other settings without `force`.
     While another process senses this clip, wait after a call of `on_wait`.
     """
-    draw = prepare(clip, sensing)
+    draw, missed = followed(clip, sensing, prepare(clip, sensing))
     meta = describe(clip, sensing, draw)
     efficiency = draw.sensor.efficiency
     whole = dataclasses.replace(draw.level, ppp=draw.level.ppp * draw.planes)  # of a code, not of a clip frame
@@ -265,16 +273,12 @@ def sense(
     if draw.shares is not None:
         line += f"; {gates.words(draw.shares)}"
     line += draw.about_flicker(clip)
+    if draw.rows is None and draw.planes % 2 == 0:
+        line += "; its truth is half a clip frame late, which an odd number of slices avoids"
     if draw.defects is not None:
         effects = [key for key, value in draw.defects.to_dict().items() if value and key != "device_seed"]
         line += f"; defects: {', '.join(effects) or 'none'}"
-    missed = draw.missed(clip)
-    if missed is None and sensing.follow:
-        missed = Effects(0.0, 0.0, 0.0)
     if missed is not None:
-        followed = sensing.follow or missed.largest > TOLERANCE
-        draw = dataclasses.replace(draw, followed=missed if followed else None)
-        meta["drawn_by"] = draw.law
         meta["dead_time_effects"] = dataclasses.asdict(missed)
         line += f"; {missed}: {'photon by photon' if draw.followed else 'below ' + str(TOLERANCE) + ', closed form'}"
     kept = None if force else _kept(clip, sensing, draw, meta)

@@ -120,10 +120,10 @@ class Stream:
     def truth(self, start: int = 0, stop: int | None = None, *, at: str = "row") -> Array:
         """Return the photons that a perfect restorer would find, float64 [stop - start, H, W].
 
-        Those of a colour clip are [stop - start, 3, H, W], the photons of each band.
-        They are expected photons per pixel and exposure at mid-exposure, without blur. A code of several clip frames
-        has the light of its middle one times their number. Where rows have their own time, each is that of the clip
-        frame nearest to its mid-exposure; `at="frame"` takes all from the middle of the frame, undistorted by motion.
+        Those of a colour clip are [stop - start, 3, H, W]. They are expected photons per pixel and exposure at
+        mid-exposure, without blur. A code of several clip frames has the light of its middle one times their number:
+        of an even number the later of two, half a clip frame late. Where rows have their own time, each is that of the
+        frame nearest to its mid-exposure; `at="frame"` takes all from the middle of the code, undistorted by motion.
         `ValueError` for frames that do not exist and imported streams, `FileNotFoundError` for a stream without a clip.
         """
         if at not in ("row", "frame"):

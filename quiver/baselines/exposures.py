@@ -19,6 +19,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.sensor.estimation import pieces
+from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from quiver.baselines.naive_mean import dark_codes
 from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_frames
@@ -28,6 +29,8 @@ DARKEST = 1e-5  # of the brightest light: the first level above darkness
 FEW = 1e-3  # Poisson events of a full exposure: the first level has no more, however bright the last one is
 CHUNK = 1 << 22  # likelihoods, and entries of histograms, held at a time
 TABLE_BYTES = 1 << 28  # most of a table of likelihoods: 3 exposures of 12 bits
+FEW_BITS = 8  # up to which only the top code counts as saturated: of few codes none is spared near the full well
+SCATTER = 4.0  # deviations of the read noise below the full well, from which on codes of more bits are saturated
 
 Estimate = Callable[[Array, Array, Sensor, float], Array]  # codes [window, N], their shares, ... -> photons [N]
 
@@ -63,12 +66,24 @@ def restore(
 
 def naive(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> Array:
     """Return photons [N] of codes [window, N]: the mean of the codes below saturation, weighted by their exposures."""
-    top, step = sensor.levels - 1, sensor.white(exposure) / (sensor.levels - 1)
+    step = sensor.white(exposure) / (sensor.levels - 1)
     dark = np.array([dark_codes(sensor, exposure * share) for share in shares])
-    open_ = codes < top
+    open_ = codes < _saturated(sensor)
     open_[np.argmin(shares)] |= ~open_.any(axis=0)  # all saturated: the shortest exposure alone
     signal = np.where(open_, codes - dark[:, None], 0.0).sum(axis=0)
     return np.maximum(signal, 0) * step / (shares[:, None] * open_).sum(axis=0)
+
+
+def _saturated(sensor: Sensor) -> int:
+    """Return the lowest code that counts as saturated: the top code, or of many bits one near the full well.
+
+    Read noise is added behind the full well, so that saturated codes scatter around that of the full well. However
+    strong it is, the lower half of the full well counts as light.
+    """
+    if not isinstance(sensor, QIS) or sensor.full_well is None or sensor.bits <= FEW_BITS:
+        return sensor.levels - 1
+    electrons = max(sensor.full_well - SCATTER * sensor.read_noise, sensor.full_well / 2)
+    return int(sensor.codes_of(np.array(electrons)))
 
 
 def moment(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> Array:

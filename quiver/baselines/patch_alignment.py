@@ -39,7 +39,7 @@ class Level:
 # Finest first. The integer search alone reaches 8 * 8 + 4 * 2 + 1 = 73 pixels.
 LEVELS = (Level(1, 16, 8, 1, False), Level(2, 16, 16, 4, True), Level(4, 8, 8, 8, True))
 ITERATIONS = 3  # of Lucas-Kanade
-TIE = 1e-5  # mean absolute difference per pixel, in units of the top code, below which two shifts are equally good
+TIE = 1e-5  # mean absolute difference per pixel, in the unit of the images, below which two shifts are equally good
 
 
 def pad_image(image: Tensor) -> Tensor:

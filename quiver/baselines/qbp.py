@@ -59,8 +59,10 @@ class Settings:
 
 CALIBRATED = Settings()
 AS_PUBLISHED = Settings(prefilter=1, wiener=8.0, wiener_variance="patch", refine_finest=False)
-EPSILON = float(np.finfo(np.float32).eps)  # least variance, in units of the top code squared
+EPSILON = float(np.finfo(np.float32).eps)  # least variance, in the squared unit of codes, `_unit`
 EXCESS = 1.0  # best of 0.8, 1, 1.25, 1.5, 2 on the clips on which CALIBRATED was chosen
+WIDE = 255  # the top code up to which it is the unit of codes
+BRIGHT = 8.0  # unit of codes of more bits, in mean codes
 
 
 def restore(
@@ -101,15 +103,28 @@ def merge(codes: Array, frame: int, table: Response, window: int, settings: Sett
     if window % settings.block:
         raise ValueError(f"window is {window} frames, which blocks of {settings.block} do not divide")
     here, start = _present(frame, window, len(codes)), frame - window // 2
-    stack = codes[here.start : here.stop].astype(np.float32) / table.top
+    present = codes[here.start : here.stop]
+    unit = _unit(present, table)
+    stack = present.astype(np.float32) / unit
     frames = xp.stack([patch_alignment.pad_image(image) for image in single(stack)])
     places = range(start - here.start, start - here.start + window)
     shifts = frame_shifts(frames, places, settings)
     blocks = [slice(block.start, block.stop) for block in _blocks(len(frames), places, settings.block)]
     middle = next(i for i, block in enumerate(blocks) if block.stop > frame - here.start)
-    merged = _merge_patches([(frames[block], shifts[block]) for block in blocks], middle, table, settings)
+    merged = _merge_patches([(frames[block], shifts[block]) for block in blocks], middle, table, unit, settings)
     height, width = codes.shape[1:]
-    return np.asarray(table.top * merged[:height, :width])
+    return np.asarray(unit * merged[:height, :width])
+
+
+def _unit(codes: Array, table: Response) -> float:
+    """Return the code that frames are divided by: the top code, or less where many bits see little light.
+
+    What counts as equal in alignment and the least variance are fixed in this unit. In units of the top code of 16
+    bits a few photons would be nothing. The mean code decides: a hot pixel does not change it.
+    """
+    if table.top <= WIDE:
+        return table.top
+    return float(np.clip(BRIGHT * codes.mean(), WIDE, table.top))
 
 
 def _present(frame: int, window: int, length: int) -> range:
@@ -200,15 +215,17 @@ def _warp_block(frames: Tensor, shifts: Tensor, corner: Tensor, smooth: bool) ->
     return xp.where(count > 0, total / xp.clip(count, 1, None), edge / len(frames))
 
 
-def _merge_patches(blocks: list[tuple[Tensor, Tensor]], middle: int, table: Response, settings: Settings) -> Tensor:
-    """Return the merged image from blocks of frames [F, H, W] and shifts [F, 2, N]: aligned patches, spectra, Wiener
-    weights, overlap-add. Blocks count by their frames.
+def _merge_patches(
+    blocks: list[tuple[Tensor, Tensor]], middle: int, table: Response, unit: float, settings: Settings
+) -> Tensor:
+    """Return the merged image from blocks of frames [F, H, W] in a unit of codes, and shifts [F, 2, N]: aligned
+    patches, spectra, Wiener weights, overlap-add. Blocks count by their frames.
     """
     shape, counts = blocks[0][0].shape[1:], [len(frames) for frames, _ in blocks]
     corner = patch_alignment.grid(shape, patch_alignment.LEVELS[0])[0]
     size, own, smooth = patch_alignment.LEVELS[0].patch, counts[middle], settings.refine_finest
     reference = _warp_block(*blocks[middle], corner, smooth)
-    noise = size * size * settings.wiener * _noise(reference, own, table, settings)
+    noise = size * size * settings.wiener * _noise(reference, own, table, unit, settings)
     spectrum = xp.fft.rfft2(reference, None, (0, 1))
     total = own * spectrum
     for i, (count, block) in enumerate(zip(counts, blocks, strict=True)):
@@ -223,16 +240,16 @@ def _merge_patches(blocks: list[tuple[Tensor, Tensor]], middle: int, table: Resp
     return xp.clip(overlap_add(patches, corner, shape), 0, None)
 
 
-def _noise(reference: Tensor, frames: int, table: Response, settings: Settings) -> Tensor:
-    """Return the variance of a pixel of each reference patch [N], in units of the top code squared; a patch is the mean
-    of this many frames.
+def _noise(reference: Tensor, frames: int, table: Response, unit: float, settings: Settings) -> Tensor:
+    """Return the variance of a pixel of each reference patch [N], in the squared unit of codes of the patches; a patch
+    is the mean of this many frames.
     """
     size = len(reference)
     if settings.wiener_variance == "patch":
         spread = reference - reference.mean((0, 1))
         return xp.clip(xp.square(spread).sum((0, 1)) / (size**2 - 1), EPSILON, None)
-    mean_code = np.asarray(table.top * reference.mean((0, 1)))
-    variance = np.interp(mean_code, table.mean, table.variance) / (frames * table.top**2)
+    mean_code = np.asarray(unit * reference.mean((0, 1)))
+    variance = np.interp(mean_code, table.mean, table.variance) / (frames * unit**2)
     return single(np.maximum(variance, EPSILON))
 
 

@@ -49,6 +49,7 @@ def _run_domain(args: argparse.Namespace) -> int:
     from quiver.restoration.networks import network_restorer
     from quiver.restoration.restorers import weights_path
     from quiver.restoration.sources import refuse, refuse_idle
+
     if args.force:
         args.after_interrupt = WITHOUT_FORCE
 

@@ -101,6 +101,7 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver.restoration.restorers import weights_path
     from quiver.training.loop import Diverged, train
     from quiver.training.run_folder import draw_curve
+
     if args.force:
         args.after_interrupt = WITHOUT_FORCE
 

@@ -41,7 +41,7 @@ class CodeTable:
         darkest, lightest = edges * (1 - MARGIN), edges[1:] * (1 + MARGIN)
         low = sensor.cdf(darkest, exposure)[:, :-1]
         high = np.concatenate([sensor.cdf(lightest, exposure)[:, :-1], np.zeros((1, low.shape[1]))])
-        if (np.diff(low, axis=0) > 1e-9).any():
+        if np.isfinite(sensor.brightest(exposure)) or (np.diff(low, axis=0) > 1e-9).any():
             raise ValueError("this sensor's codes do not grow with light; no table can hold them")
         u = np.arange(CELLS + 1) / CELLS
         least = np.stack([np.searchsorted(row, u[:-1], side="right") for row in low])

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -20,7 +21,7 @@ from numpy import ndarray as Array
 from qsim.clip.clip import Clip
 from qsim.clip.lazy_array import LazyArray
 from qsim.clip.photons import clip_photons
-from qsim.clip.sensing import describe
+from qsim.clip.sensing import describe, followed
 from qsim.clip.stream import Stream
 from qsim.files import read_json, sha256, to_json, wording
 from qsim.keys import Key, hash_name
@@ -75,6 +76,7 @@ class Codes:
     shares: tuple[float, ...] | None = None  # exposures of codes in turn, over `exposure`; None: all are full
     defective: Array | None = field(default=None, compare=False)  # bool [H, W]; pixels that `read` fills from others
     colour: ColourFilter | None = None  # over the pixels, from the first one on; None: all see one band
+    not_inverted: str = ""  # defects that add detections, which the sensor's response leaves out: crosstalk, afterpulse
 
     @property
     def white(self) -> float:
@@ -112,7 +114,8 @@ def filled(codes: Codes, bad: Array | None) -> Codes:
     marked = bad if codes.defective is None else bad | codes.defective
     rows, columns = (1, 1) if codes.colour is None else codes.colour.tile  # neighbours of one colour fill a pixel
     places = {(i, j): marked[i::rows, j::columns] for i in range(rows) for j in range(columns)}
-    fillers = {place: defects.Filler(own) for place, own in places.items() if own.any()}
+    picks = defects.skips_codes(codes.sensor)
+    fillers = {place: defects.Filler(own, picks) for place, own in places.items() if own.any()}
 
     def read(start: int, stop: int) -> Array:
         part = codes.read(start, stop)
@@ -213,14 +216,20 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
 def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float]:
     """Return the codes of a clip under a light level, and the light factor: the codes that `qsim sense` would store.
 
-    Codes are drawn when they are read; dead and hot pixels of the sensor's defects are filled.
+    Codes are drawn when they are read, those of pixels followed photon by photon all at once; dead and hot pixels of
+    the sensor's defects are filled.
     """
-    sensing, draw = light.sensing(seed), light.draw(clip, seed)
+    sensing = light.sensing(seed)
+    draw, _ = followed(clip, sensing, light.draw(clip, seed))
     bad = defects.of_draw(draw, clip.exposure, (clip.shape[1], clip.shape[2]))
+
+    @cache
+    def complete() -> Array:
+        return draw.frames(clip, 0, len(clip))
 
     def read(start: int, stop: int) -> Array:
         try:
-            return draw.frames(clip, start, stop)
+            return draw.frames(clip, start, stop) if draw.followed is None else complete()[start:stop]
         except ValueError as error:
             raise ValueError(f"{clip.path}: frames {start}..{stop - 1}: {error}") from None
 
@@ -236,6 +245,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
         sensor_name=light.sensor,
         ppp=draw.level.ppp,
         colour=draw.colour,
+        not_inverted=_not_inverted(vars(draw.defects) if draw.defects else {}),
     )
     return filled(codes, bad), draw.level.factor
 
@@ -258,6 +268,7 @@ def stream_codes(stream: Stream) -> Codes:
         meta.get("ppp"),
         stream.shares,
         colour=stream.colour_filter,
+        not_inverted=_not_inverted(meta.get("defects") or {}),
     )
     return filled(codes, bad)
 
@@ -279,9 +290,15 @@ def codes_of(stream: Stream) -> Codes:
 
 def repaired(codes: Codes, found: defects.Defects | None) -> Codes:
     """Return the codes of a sensor with these defects: dead and hot pixels filled, the dark rate that of the others."""
-    codes = replace(codes, sensor=defects.as_measured(found, codes.sensor, codes.shape[1:]))
+    left = _not_inverted(vars(found) if found else {})
+    codes = replace(codes, sensor=defects.as_measured(found, codes.sensor, codes.shape[1:]), not_inverted=left)
     bad = defects.defective(found, codes.sensor, codes.exposure, light_of(codes), codes.shape[1:])
     return filled(replace(codes, sensor=defects.behind(bad, found, codes.sensor)), bad)
+
+
+def _not_inverted(table: Mapping[str, Any]) -> str:
+    """Return which of the defects of a table add detections that no response takes off, as text."""
+    return " and ".join(key for key in ("crosstalk", "afterpulse") if table.get(key))
 
 
 def open_stream(path: Path) -> Stream:

@@ -4,8 +4,10 @@
 
 A defective pixel takes the mean of the codes of its eight nearest good pixels in the same frame, weighted by the
 inverse square of their distance, and rounded up or down by chance, so that its expectation is this mean: rounding to
-the nearest code would shift the light of few-bit codes. The chance is keyed by frame and pixel: repeats are equal.
-Other frames are not used: what moves is elsewhere in them, and every method merges frames itself.
+the nearest code would shift the light of few-bit codes. Where an electron is worth several codes, a mean may be a code
+that the sensor cannot produce: there one of the eight codes is chosen by weight, with the same expectation. The chance
+is keyed by frame and pixel: repeats are equal. Other frames are not used: what moves is elsewhere in them, and every
+method merges frames itself.
 
 The map is given, or known: a stream drawn with a table [defects] states its dead and hot pixels. It is not guessed from
 the codes: a hot pixel looks like a small bright thing at rest, and at 13 % hot pixels they touch one another.
@@ -28,22 +30,27 @@ from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.defects.good_pixels import behind as behind
 from qsim.sensor.defects.good_pixels import defective
 from qsim.sensor.defects.pixel_array import PixelArray
+from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 
 NEIGHBOURS = 8  # good pixels that a defective one is filled from
 STAGE = 4  # of the random keys
+REACH = 2  # standard deviations of read noise around an electron, within which codes occur
 
 
 class Filler:
     """Fills the defective pixels of one map."""
 
-    def __init__(self, bad: Array) -> None:
-        """Find the neighbours of every defective pixel of a map, bool [H, W]. `ValueError` if no pixel is good."""
+    def __init__(self, bad: Array, picks: bool = False) -> None:
+        """Find the neighbours of every defective pixel of a map, bool [H, W]. `ValueError` if no pixel is good.
+
+        With `picks` a pixel takes the code of one neighbour; otherwise the mean of all.
+        """
         from scipy.spatial import cKDTree
 
         if bad.all():
             raise ValueError(f"all {bad.size} pixels are marked as defective; the map is true at defective pixels")
-        self.bad = bad
+        self.bad, self.picks = bad, picks
         good = np.argwhere(~bad)
         count = min(NEIGHBOURS, len(good))
         distance, index = cKDTree(good).query(np.argwhere(bad), k=range(1, count + 1))
@@ -53,11 +60,21 @@ class Filler:
     def fill(self, codes: Array, first: int) -> Array:
         """Return codes [T, H, W] with the defective pixels filled; frames are numbered from `first`."""
         flat = codes.reshape(len(codes), -1)
-        means = np.einsum("tnk,nk->tn", flat[:, self.sources].astype(float), self.weights)
+        near = flat[:, self.sources]  # [T, n, k]
         chance = keys.uniform(keys.words(Key(0, 0, first, STAGE), codes.shape))[:, self.bad]
         filled = codes.copy()
-        filled[:, self.bad] = np.floor(means + chance).astype(codes.dtype)
+        if self.picks:
+            chosen = (chance[..., None] > self.weights.cumsum(axis=1)[:, :-1]).sum(axis=-1, keepdims=True)
+            filled[:, self.bad] = np.take_along_axis(near, chosen, axis=-1)[..., 0]
+        else:
+            means = np.einsum("tnk,nk->tn", near.astype(float), self.weights)
+            filled[:, self.bad] = np.floor(means + chance).astype(codes.dtype)
         return filled
+
+
+def skips_codes(sensor: Sensor) -> bool:
+    """Return whether codes between those of n and n + 1 electrons hardly ever occur: read noise does not reach them."""
+    return isinstance(sensor, QIS) and sensor.gain * (1 - 2 * REACH * sensor.read_noise) > 1
 
 
 def as_measured(defects: Defects | None, sensor: Sensor, shape: tuple[int, int]) -> Sensor:

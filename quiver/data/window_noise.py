@@ -22,7 +22,7 @@ from qsim.keys import Key
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
 from quiver.data.code_table import draw_codes
-from quiver.data.defects import Filler, behind, defective
+from quiver.data.defects import Filler, behind, defective, skips_codes
 from quiver.data.noise import Noise, stored_defects
 
 NEGLIGIBLE = 1e-6  # chance of an afterpulse chain that is as long as the frames before a window
@@ -77,10 +77,10 @@ def behind_defects(noise: Noise, draw: Draw, clip: Clip) -> tuple[Array | None, 
     return bad, behind(bad, table, draw.sensor, draw.origin)
 
 
-def window_filler(bad: Array | None, place: WindowPlace, side: int) -> Filler | None:
+def window_filler(bad: Array | None, place: WindowPlace, side: int, sensor: Sensor) -> Filler | None:
     """Return what fills the dead and hot pixels `bad` of a window [side, side], not turned; None without any."""
     crop = None if bad is None else bad[place.y : place.y + side, place.x : place.x + side]
-    return None if crop is None or not crop.any() else Filler(crop)
+    return None if crop is None or not crop.any() else Filler(crop, skips_codes(sensor))
 
 
 def window_codes(

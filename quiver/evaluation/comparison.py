@@ -211,6 +211,11 @@ def check(comparison: Comparison) -> list[Clip]:
             raise ValueError(
                 f"--published: draws windows without defects, and {light.sensor} has a table [defects]; leave it out"
             )
+        if comparison.published and light.draw(clips[0]).remembers:
+            raise ValueError(
+                f"--published: draws windows one by one, and the charge of a spike camera ({light.sensor}) stays "
+                "between them; leave it out"
+            )
     return clips
 
 

@@ -43,9 +43,9 @@ def restore(
     (mergenet), a .safetensors file or a folder of `quiver train`. `device` (auto, cpu, cuda) and `mode` (exact,
     streaming, windows) are for networks. `auto` takes mergenet, or a classical method where that was measured to be
     better, and `likelihood` for codes of different exposures. `defects` [H, W] is true at hot and dead pixels, which
-    are filled from their neighbours, as are those that a stream's description states. A network outside of what it was
-    measured for warns; with `strict` it is a `ValueError`. `ValueError` or `FileNotFoundError` where the arguments do
-    not fit together.
+    are filled from their neighbours, as are those that a stream's description states; crosstalk and afterpulses, which
+    are not inverted, warn. A network outside of what it was measured for warns; with `strict` it is a `ValueError`.
+    `ValueError` or `FileNotFoundError` where the arguments do not fit together.
 
         video = quiver.restore(stream)
     """
@@ -59,6 +59,8 @@ def restore(
     found = remarks([runner], codes)
     if strict:
         refuse_outside([runner], found, "strict=", named=method != AUTO)
+    if codes.not_inverted:
+        found.append(f"{codes.name}: {codes.not_inverted} not inverted, restored light is too bright")
     for text in found:
         warnings.warn(text, stacklevel=2)
     restored = runner.restore(codes)

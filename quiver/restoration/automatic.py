@@ -15,6 +15,7 @@ from quiver.data.codes import Codes
 from quiver.restoration.domain import place_of
 from quiver.restoration.domain_remarks import light_of
 from quiver.restoration.interface import AUTO, RestoreOptions, Restorer
+from quiver.restoration.mosaics import by_colour
 from quiver.restoration.restorers import restorer
 
 NETWORK = "mergenet"
@@ -50,7 +51,10 @@ def chosen_for_all(
 
 
 def _best(codes: Codes, known: dict[str, Restorer], options: RestoreOptions | None) -> tuple[str, str]:
-    """Return the name of the best method for a stream, and why. The network is loaded once, into `known`."""
+    """Return the name of the best method for a stream, and why. The network is loaded once, into `known`.
+
+    Each colour of a mosaic is restored alone: one for which the network was measured to be worse decides.
+    """
     if codes.shares is not None:
         if exposures.table_bytes(codes.shares, codes.sensor, codes.exposure) > exposures.TABLE_BYTES:
             return (
@@ -62,12 +66,18 @@ def _best(codes: Codes, known: dict[str, Restorer], options: RestoreOptions | No
         network = known.get(NETWORK) or known.setdefault(NETWORK, restorer(NETWORK, options))
     except ModuleNotFoundError as error:
         return WITHOUT, f"{NETWORK} needs the package {error.name}"
-    ppp = light_of(codes)
     domain = None if network.scope is None else network.scope.domain
-    cell = None if domain is None else domain.nearest(place_of(codes.sensor, codes.exposure, ppp))
-    if cell is None:
-        return NETWORK, f"nothing was measured near {codes.sensor.bits} bit, {ppp:.3g} PPP"
-    return NETWORK if cell.wins else cell.classical, f"measured at {cell.name}: {cell.scores}"
+    measured, unknown = "", ""
+    for part in by_colour(codes):
+        ppp = light_of(part)
+        cell = None if domain is None else domain.nearest(place_of(part.sensor, part.exposure, ppp))
+        if cell is None:
+            unknown = unknown or f"nothing was measured near {part.sensor.bits} bit, {ppp:.3g} PPP"
+        elif not cell.wins:
+            return cell.classical, f"measured at {cell.name}: {cell.scores}"
+        else:
+            measured = measured or f"measured at {cell.name}: {cell.scores}"
+    return NETWORK, unknown or measured
 
 
 def _listed(names: list[str]) -> str:

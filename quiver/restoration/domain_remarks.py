@@ -12,6 +12,7 @@ from quiver.data.codes import DARKEST, Codes, light_of
 from quiver.data.illumination import Illumination
 from quiver.restoration.domain import NEAR, UP_TO_A_FACTOR, OperatingPoint, Scope, place_of
 from quiver.restoration.interface import RestoreOptions, Restorer
+from quiver.restoration.mosaics import by_colour
 
 DARK = 0.1  # dark counts over the events of the mean light, above which a stream is unlike all cells
 CHANGE = 0.08  # of the light within eleven frames, above which a stream is unlike all cells: they reach 0.05
@@ -81,15 +82,20 @@ def _dark_text(share: float) -> str:
 
 def remarks(methods: Iterable[Restorer], codes: Codes) -> list[str]:
     """Return the remarks on all networks among the methods."""
-    return [text for method in methods if (text := _remark(method, codes)) is not None]
+    return [text for method in methods for text in _remarks(method, codes)]
 
 
-def _remark(method: Restorer, codes: Codes) -> str | None:
-    """Return the remark on a method; None for a classical one, and where there is nothing to say."""
+def _remarks(method: Restorer, codes: Codes) -> list[str]:
+    """Return the different remarks on a method, of a mosaic on the light of each colour, which is restored alone.
+
+    None for a classical one, and where there is nothing to say.
+    """
     if method.scope is None:
-        return None
-    text = remark(method.name, method.scope, codes) or _run_unlike(method)
-    return text if not method.scope.relative else f"{text or f'{method.name} was converted'}; {UP_TO_A_FACTOR}"
+        return []
+    said = [remark(method.name, method.scope, part) or _run_unlike(method) for part in by_colour(codes)]
+    if method.scope.relative:
+        said = [f"{text or f'{method.name} was converted'}; {UP_TO_A_FACTOR}" for text in said]
+    return list(dict.fromkeys(text for text in said if text is not None))
 
 
 def _run_unlike(method: Restorer) -> str | None:
@@ -107,11 +113,16 @@ def _run_unlike(method: Restorer) -> str | None:
 
 
 def measured_at(method: Restorer, codes: Codes) -> str | None:
-    """Return the measurement that is nearest to a stream, as a line for --verbose; None where there is none."""
+    """Return the measurement that is nearest to a stream, as a line for --verbose; None where there is none.
+
+    Of a mosaic it is that of every colour.
+    """
     if method.scope is None or method.scope.domain is None:
         return None
-    cell = method.scope.domain.nearest(place_of(codes.sensor, codes.exposure, light_of(codes)))
-    return None if cell is None else f"{method.name} was measured at {cell.name}: {cell.scores}"
+    places = [place_of(part.sensor, part.exposure, light_of(part)) for part in by_colour(codes)]
+    cells = [cell for place in places if (cell := method.scope.domain.nearest(place)) is not None]
+    told = dict.fromkeys(f"{cell.name}: {cell.scores}" for cell in cells)
+    return f"{method.name} was measured at {'; '.join(told)}" if told else None
 
 
 def refuse_outside(methods: Sequence[Restorer], found: Sequence[str], option: str, *, named: bool = True) -> None:

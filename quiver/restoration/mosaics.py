@@ -33,22 +33,40 @@ def places(codes: Codes) -> Iterator[tuple[tuple[int, int], Codes]]:
     """
     assert codes.colour is not None
     check_bands(codes)
-    length, height, width = codes.shape
+    _, height, width = codes.shape
     rows, columns = codes.colour.tile
     if height < rows or width < columns:
         raise ValueError(
             f"{codes.name}: frames of {height} x {width} px are smaller than the mask's {rows} x {columns}"
         )
-    seen = codes.colour.weights(codes.sensor.efficiency).sum(axis=0)
     for i, j in np.ndindex(rows, columns):
+        yield (i, j), _place(codes, i, j)
 
-        def read(start: int, stop: int, i: int = i, j: int = j) -> Array:
-            return np.ascontiguousarray(codes.read(start, stop)[:, i::rows, j::columns])
 
-        shape = (length, len(range(i, height, rows)), len(range(j, width, columns)))
-        ppp = None if codes.ppp is None else codes.ppp * float(seen[i, j])
-        name = f"{codes.name}, {codes.colour.mask[i][j]}"
-        yield (i, j), replace(codes, name=name, shape=shape, read=read, ppp=ppp, colour=None, defective=None)
+def by_colour(codes: Codes) -> list[Codes]:
+    """Return the codes of the first place of every colour, each with its own light; of one band the stream itself."""
+    if codes.colour is None:
+        return [codes]
+    (rows, columns), (_, height, width) = codes.colour.tile, codes.shape
+    found: dict[str, Codes] = {}
+    for i, j in np.ndindex(min(rows, height), min(columns, width)):
+        found.setdefault(codes.colour.mask[i][j], _place(codes, i, j))
+    return list(found.values())
+
+
+def _place(codes: Codes, i: int, j: int) -> Codes:
+    """Return the codes [T, h, w] of the pixels at row i, column j of the tile, as a stream of one band."""
+    assert codes.colour is not None
+    (length, height, width), (rows, columns) = codes.shape, codes.colour.tile
+
+    def read(start: int, stop: int) -> Array:
+        return np.ascontiguousarray(codes.read(start, stop)[:, i::rows, j::columns])
+
+    shape = (length, len(range(i, height, rows)), len(range(j, width, columns)))
+    seen = float(codes.colour.weights(codes.sensor.efficiency)[:, i, j].sum())
+    ppp = None if codes.ppp is None else codes.ppp * seen
+    name = f"{codes.name}, {codes.colour.mask[i][j]}"
+    return replace(codes, name=name, shape=shape, read=read, ppp=ppp, colour=None, defective=None)
 
 
 def fill_mosaic(

@@ -111,6 +111,8 @@ def _described(codes: Codes, method: Restorer) -> dict[str, Any]:
     }
     if codes.colour is not None:
         meta["colour"] = codes.colour.to_dict() | {"bands": "R, G, B", "by": "places of the mask, then demosaicing"}
+    if codes.not_inverted:
+        meta["not_inverted"] = codes.not_inverted
     return meta
 
 

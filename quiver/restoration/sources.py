@@ -133,6 +133,7 @@ def assumed(codes: Codes, method: Restorer) -> str:
         rows, columns = codes.colour.tile
         light += f", each of {rows} x {columns} places of the colour filters alone, then demosaiced"
     light += f", {bad} of {height * width} pixels defective and filled from their neighbours" if bad else ""
+    light += f", {codes.not_inverted} not inverted (restored light is too bright)" if codes.not_inverted else ""
     seen = f"{method.frames_used} frames" if method.seamless else f"all earlier and {method.look_ahead} later frames"
     return (
         f"{codes.name}: {length} frames of {height} x {width}, {codes.frame_rate:g} codes/s; "

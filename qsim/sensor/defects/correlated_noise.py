@@ -16,6 +16,7 @@ from numpy import ndarray as Array
 from qsim.keys import Key, uniform, words
 
 _AFTERPULSE, _CROSSTALK = 101, 102  # stages of a clip's key; crosstalk takes one per direction
+_PER_STAGE = 1 << 20  # from the stages of one use of a clip to those of the next
 _DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))  # from a pixel to the neighbour that it disturbs
 
 
@@ -48,6 +49,11 @@ class CorrelatedNoise:
         return result, before
 
 
+def _step(key: Key, number: int) -> Key:
+    """Return the key of a random step of this noise: keys of different stages, as of two uses, share no numbers."""
+    return replace(key, stage=number + _PER_STAGE * key.stage)
+
+
 def _afterpulses(
     plane: Array, before: Array | None, key: Key, dead: Array | None, probability: float, origin: tuple[int, int]
 ) -> tuple[Array, Array]:
@@ -58,7 +64,7 @@ def _afterpulses(
     """
     if not probability or before is None:
         return plane, plane
-    released = uniform(words(replace(key, stage=_AFTERPULSE), plane.shape, origin)) < probability
+    released = uniform(words(_step(key, _AFTERPULSE), plane.shape, origin)) < probability
     after = plane | (before & released.astype(plane.dtype))
     after = after if dead is None else np.where(dead, plane.dtype.type(0), after)
     return after, after
@@ -80,7 +86,7 @@ def _crosstalk(
     total = codes.astype(np.int64)
     height, width = codes.shape
     for number, (dy, dx) in enumerate(_DIRECTIONS):
-        u = uniform(words(replace(key, stage=_CROSSTALK + number), codes.shape, origin))
+        u = uniform(words(_step(key, _CROSSTALK + number), codes.shape, origin))
         sent, j = np.zeros(codes.shape, np.int64), 0
         while (more := (j < codes) & (u >= bdtr(j, np.maximum(codes, 1), probability))).any():
             sent, j = sent + more, j + 1

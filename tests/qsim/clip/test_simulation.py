@@ -11,6 +11,7 @@ from compiled_cases import needs_engine
 
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
+from qsim.clip.rows import Rows
 from qsim.clip.sensing import Sensing, describe, prepare, replay, sense, write_stream
 from qsim.clip.simulation import stored
 from qsim.sensor import packing
@@ -77,6 +78,18 @@ def test_codes_whose_truth_has_other_light_say_so(tmp_path, bits, stated):
     assert len(stream) == 14 // (2**bits - 1)
     words = "light flickers within a code, by up to 57.1 % of its mean: its truth has the light of its middle clip"
     assert (f"; {words} frame; render at the code rate with --shutter 1" in line) == stated
+
+
+@pytest.mark.parametrize(
+    ("how", "stated"),
+    [({"slices": 2}, True), ({"slices": 3}, False), ({"slices": 1}, False), ({"slices": 2, "rows": Rows(1e-5)}, False)],
+)
+def test_a_truth_that_is_late_is_stated(tmp_path, how, stated):
+    """Two slices have no middle frame; rows at their own time take the frame nearest to each."""
+    clip = write_clip(tmp_path / "c", frames=9, height=7, width=9)
+    stream, line = sense(clip, Sensing(BITS3, ppp=3.0, name="s", **how))
+    assert ("; its truth is half a clip frame late, which an odd number of slices avoids" in line) == stated
+    assert len(stream) >= 3
 
 
 def test_what_a_spike_camera_does_not_model_is_refused(clip, tmp_path):

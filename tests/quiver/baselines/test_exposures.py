@@ -157,3 +157,25 @@ def test_a_table_of_likelihoods_that_is_too_large_is_refused(monkeypatch):
     assert method.name == "moment"
     assert why == "auto: moment; the codes have different exposures, and 6 bit are too many for likelihood"
     assert method.restore(stream).shape == codes.shape
+
+
+@pytest.mark.parametrize("gain", [0.4095, 0.2], ids=["at the top code", "below it"])
+def test_the_naive_mean_leaves_codes_at_the_full_well_out(gain):
+    """Light of four full wells on 12 bits: read noise spreads saturated codes, and few of them are the top one."""
+    sensor, light = QIS(0.6, 100.0, 5.0, 12, gain=gain, full_well=1e4), 4e4 / 0.6
+    shares = np.resize(SCHEDULE, 30)
+    codes = drawn(sensor, np.full(200, light), shares, 10)[:, 0]
+    assert exposures.naive(codes, shares, sensor, EXPOSURE).mean() == pytest.approx(light, rel=0.1)
+
+
+def test_the_full_well_of_few_bits_leaves_no_code_out():
+    """Random sensors of 1 to 8 bits: the naive mean is that of the same sensor without a full well."""
+    rng, shares = np.random.default_rng(11), np.resize(SCHEDULE, 6)
+    for bits in np.repeat(range(1, 9), 4):
+        noise, gain, well = rng.uniform(0, 3), rng.uniform(0.2, 1.2), rng.uniform(1, 2.0**bits)
+        sensor = QIS(0.6, 100.0, noise, int(bits), gain=gain, full_well=well)
+        codes = rng.integers(0, 2**bits, (6, 50))
+        found, without = (
+            exposures.naive(codes, shares, one, EXPOSURE) for one in (sensor, replace(sensor, full_well=None))
+        )
+        np.testing.assert_array_equal(found, without)

@@ -1,5 +1,6 @@
 """Quanta Burst Photography: alignment against known motion, merging against averages, and the complete chain."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.ndimage import shift as moved_by
 
 from qsim.keys import Key
 from qsim.sensor.devices import quiver_physical
+from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import METHODS, bm3d, moment, patch_alignment, qbp
 from quiver.baselines.vst import stabiliser
@@ -211,6 +213,21 @@ def test_merging_beats_both_one_frame_and_a_plain_mean_when_things_move(settings
         )
     ]
     assert errors[0] < gain * min(errors[1:])
+
+
+def test_little_light_on_many_bits_is_merged_as_on_eight():
+    """In units of the top code of 16 bits all shifts were equally good, and all noise was the least one.
+
+    A hot pixel decides nothing far from it.
+    """
+    sensor = QIS(0.8, 1.6, 0.2, 8)
+    codes = sensor.sample(moving(3.25, 11, 2.0), EXPOSURE, key=Key(7, 7), engine="reference")
+    table = sensor.response(EXPOSURE)
+    expected, wide = qbp.merge(codes, 5, table, 11), replace(table, top=65535)
+    np.testing.assert_allclose(qbp.merge(codes.astype(np.uint16), 5, wide, 11), expected, rtol=1e-5)
+    hot = codes.astype(np.uint16)
+    hot[:, 70, 86] = 65535
+    np.testing.assert_allclose(qbp.merge(hot, 5, wide, 11)[:32, :32], expected[:32, :32], rtol=1e-5)
 
 
 def test_a_scene_at_rest_is_nearly_averaged():

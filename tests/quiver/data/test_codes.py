@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from clips import ClipMaker
 from random_codes import random_codes
+from sensor_files import COUNTER, sensor_file
 
+from qsim.clip.sensing import Sensing, sense
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
@@ -38,6 +40,17 @@ def test_sensed_codes_and_truth(make_clip: ClipMaker):
     assert truth(clip, factor, 0, 14).mean() == pytest.approx(3.25, rel=1e-6)
     assert codes.white == pytest.approx(8.75)
     assert (sensed(clip, Illumination(), seed=3)[0].read(0, 1) != whole[:1]).any()
+
+
+@pytest.mark.parametrize("table", ["afterpulse = 0.3\nafterpulse_delay = 1e-5\n", "carry_dead_time = true\n"])
+def test_counting_pixels_with_a_memory_are_followed_as_by_qsim_sense(make_clip: ClipMaker, tmp_path, table):
+    """The closed form drew them: without afterpulses, and live at the start of every exposure."""
+    clip = make_clip(frames=4, height=6, width=7)
+    file = sensor_file(tmp_path, COUNTER.replace("1e-5", "1e-4") + table, bits=3)
+    now, stored = sensed(clip, Illumination(file, 3.0, None))[0], sense(clip, Sensing(file, ppp=3.0))[0]
+    assert stored.meta["drawn_by"] == "events"
+    np.testing.assert_array_equal(now.read(0, 4), stored.codes(0, 4))
+    np.testing.assert_array_equal(now.read(2, 3), stored.codes(2, 3))
 
 
 def test_codes_in_memory_are_checked():

@@ -13,11 +13,12 @@ from stats import assert_mean
 
 from qsim.clip.sensing import Sensing, sense
 from qsim.keys import Key
+from qsim.sensor import qis
 from qsim.sensor.defects.fixed_pattern import FixedPattern, draw_maps
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import METHODS
 from quiver.data.codes import array_codes, filled, light_of, sensed, stream_codes
-from quiver.data.defects import Filler, read_map
+from quiver.data.defects import Filler, read_map, skips_codes
 from quiver.data.illumination import Illumination
 from quiver.data.windows import Windows, WindowSettings
 from quiver.restoration.restorers import restorer
@@ -51,6 +52,32 @@ def test_the_fill_has_the_mean_of_its_neighbours(bits):
         mean, variance = light * (2**bits - 1), light * (1 - light) * (2**bits - 1)
         # A filled code varies no more than a good one and the rounding; neighbours share some of their sources
         assert_mean(Filler(bad).fill(codes, 0)[:, bad].astype(float), mean, 8 * (variance + 0.25), checks=12)
+
+
+def test_codes_that_the_sensor_cannot_produce_are_not_filled_in():
+    """Two codes per electron and no read noise: no code is odd but the top one. Means of neighbours were."""
+    sensor, bad = qis.QIS(0.8, 100.0, 0.0, 3, gain=2.0), np.random.default_rng(5).random((40, 40)) < 0.13
+    codes = sensor.sample(np.full((60, 40, 40), 2.0), EXPOSURE, key=Key(1, 3), engine="reference")
+    found = filled(array_codes(codes, sensor, EXPOSURE), bad).read(0, 60)
+    assert set(np.unique(found)) == {0, 2, 4, 6, 7}
+    light = np.array([2.0])
+    mean, variance = float(sensor.mean(light, EXPOSURE)[0]), float(sensor.variance(light, EXPOSURE)[0])
+    assert_mean(found[:, bad].astype(float), mean, 8 * variance)  # neighbours share some of their sources
+
+
+@pytest.mark.parametrize("name", sorted(METHODS))
+def test_every_method_restores_filled_codes_of_a_sensor_that_skips_some(name):
+    """The likelihood of an impossible code is 0, which `likelihood` refuses."""
+    sensor, bad = qis.QIS(0.8, 100.0, 0.0, 3, gain=2.0), np.random.default_rng(3).random((20, 19)) < 0.13
+    codes = sensor.sample(np.full((2, 20, 19), 2.0), EXPOSURE, key=Key(1, 1), engine="reference")
+    assert np.isfinite(restorer(name).restore(filled(array_codes(codes, sensor, EXPOSURE), bad))).all()
+
+
+@pytest.mark.parametrize(
+    ("gain", "read_noise", "skips"), [(1.0, 0.0, False), (2.0, 0.01, True), (3.5, 0.2, False), (7.0, 0.2, True)]
+)
+def test_codes_are_skipped_where_neither_electrons_nor_read_noise_reach(gain, read_noise, skips):
+    assert skips_codes(qis.QIS(0.8, 1.6, read_noise, 3, gain=gain)) == skips
 
 
 def test_a_slope_goes_on_through_a_single_pixel():
@@ -141,6 +168,13 @@ def test_a_training_window_is_filled_too(make_clip: ClipMaker, tmp_path):
         windows = Windows([clip], WindowSettings(lights=(Illumination(path, 4.0, 3),), crop=32))
         shares.append(float((windows[0]["codes"] == 0).float().mean()))
     assert shares[0] < shares[1] + 0.02
+
+
+def test_a_training_window_holds_codes_of_its_sensor_alone(make_clip: ClipMaker, tmp_path):
+    text = QIS.replace("read_noise = 0.2", "read_noise = 0.0\ngain = 2.0") + "dead = 0.3\n"
+    light = Illumination(sensor_file(tmp_path, text, bits=3), 2.0, 3)
+    window = Windows([make_clip(frames=12, height=40, width=40)], WindowSettings(lights=(light,), crop=32))[0]
+    assert set(np.rint(7 * np.unique(window["codes"].numpy()))) == {0, 2, 4, 6, 7}
 
 
 def test_a_wrong_map_is_refused(tmp_path):

@@ -19,6 +19,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.sensing import Sensing, sense
 from qsim.clip.writer import ClipWriter
+from quiver.cli.program import main
 from quiver.data.clips import open_clips, truth
 from quiver.data.codes import Codes, sensed, stream_codes
 from quiver.data.illumination import Illumination
@@ -377,6 +378,18 @@ def test_published_windows_of_a_sensor_with_defects_are_refused(tiny_dataset, tm
         evaluate(worn, [restorer("naive")], tmp_path / "table")
     assert not (tmp_path / "table").exists()
     assert evaluate(replace(worn, published=False), [restorer("naive")])[0].failure is None
+
+
+def test_published_windows_of_a_spike_camera_are_refused(tiny_dataset, tmp_path, capsys):
+    """They were drawn as planes without a memory."""
+    text = '[sensor]\nmodel = "SpikeCamera"\nquantum_efficiency = 0.6\ndark_current = 0.0\nthreshold = 9\n'
+    (tmp_path / "spike.toml").write_text(text)
+    words = ["--methods", "naive", "--published", "--sensor", str(tmp_path / "spike.toml")]
+    assert main(["evaluate", str(tiny_dataset), "-o", str(tmp_path / "table"), *words]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "the charge of a spike camera" in said
+    assert not (tmp_path / "table").exists()
 
 
 def test_stored_streams_are_scored(tiny_dataset, make_clip: ClipMaker):

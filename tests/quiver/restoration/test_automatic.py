@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from qsim.sensor.colour_filter import MASKS, ColourFilter
 from qsim.sensor.devices import quiver_physical
 from quiver.cli.program import main
 from quiver.data.codes import array_codes
@@ -98,3 +99,10 @@ def test_streams_with_one_best_method_share_it_and_others_are_named(measured):
     with pytest.raises(ValueError, match="different methods: mergenet for day, dusk; qbp for noon; name one of them"):
         automatic.chosen_for_all("auto", [dim, bright, dimmer])
     assert automatic.chosen_for_all("moment:3", [dim, bright])[0].name == "moment:3"
+
+
+def test_the_worst_colour_of_a_mosaic_decides(measured):
+    """White pixels have three times the light of the others, at which the network loses."""
+    mosaic = replace(stream(26.0), ppp=26.0 / 3, colour=ColourFilter(MASKS["rgbw"]))
+    assert automatic.chosen("auto", mosaic)[0].name == "qbp"
+    assert automatic.chosen("auto", replace(mosaic, colour=None))[0].name == "mergenet"

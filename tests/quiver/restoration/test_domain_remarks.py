@@ -16,6 +16,7 @@ import quiver
 from qsim.clip.sensing import Sensing, sense
 from qsim.keys import Key
 from qsim.sensor import devices
+from qsim.sensor.colour_filter import MASKS, ColourFilter
 from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
 from quiver.data.clips import open_clips
@@ -265,3 +266,16 @@ def test_dark_counts_and_few_frames_are_told():
         few = stream("spad-320x240", 1.0, 1)
         text = domain_remarks.remark("mine", binary, replace(few, shape=(frames, *few.shape[1:])))
         assert text is None if words is None else text is not None and text.endswith(words)
+
+
+def test_each_colour_of_a_mosaic_is_judged_at_its_own_light():
+    """White pixels get the light of three bands, and the pixels of every place are restored alone."""
+    only, mosaic = Domain((cell(3.25, 25.0),), {}), replace(stream(), colour=ColourFilter(MASKS["rgbw"]))
+    (said,) = said_of(only, {}, mosaic)
+    assert "mine was never measured near quiver-physical, 3 bit, 9.75 PPP" in said
+    assert said_of(only, {}, replace(mosaic, colour=ColourFilter(MASKS["rggb"]))) == []
+    both = Domain((*only.cells, cell(9.75, 18.0)), {})
+    found = said_of(both, {}, replace(mosaic, sensor=devices.load("quiver-physical", ppp=9.75, bits=3)))
+    assert len(found) == 2
+    assert "never measured near quiver-physical, 3 bit, 3.25 PPP" in found[0]
+    assert "mine is worse than qbp-bm3d on quiver-physical, 3 bit, 9.75 PPP" in found[1]

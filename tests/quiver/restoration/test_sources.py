@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 from sensor_files import SPAD, sensor_file
 
+import quiver
+from qsim.clip.sensing import Sensing, sense
 from quiver.cli.program import main
+from quiver.data.codes import array_codes, repaired, sensed, stream_codes
+from quiver.data.illumination import Illumination, read_sensor
 from quiver.restoration.interface import RestoreOptions
+from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import restorer
+from quiver.restoration.sources import assumed
 
 # Options
 
@@ -172,3 +178,18 @@ def test_a_mode_of_a_network_that_has_one_is_refused(inputs, tmp_path, capsys):
     assert main(words) == 0
     assert "exact" not in capsys.readouterr().err
     assert restorer(words[-1], RestoreOptions(mode="streaming")).seamless
+
+
+def test_defects_that_are_not_inverted_are_told(make_clip, tmp_path):
+    """Of a stored stream, a clip that is sensed now and a bare array: in the line, the json and the call in Python."""
+    clip = make_clip(frames=2, height=8, width=8)
+    path = sensor_file(tmp_path, SPAD + "crosstalk = 0.05\nafterpulse = 0.1\n")
+    stream = sense(clip, Sensing(path, ppp=1.0))[0]
+    bare = array_codes(stream.codes(0, 2), stream.sensor, stream.exposure)
+    now, naive = sensed(clip, Illumination(path, 1.0, None))[0], restorer("naive")
+    for codes in (stream_codes(stream), now, repaired(bare, read_sensor(path)[1])):
+        assert ", crosstalk and afterpulse not inverted (restored light is too bright)," in assumed(codes, naive)
+    assert "inverted" not in assumed(bare, naive)
+    assert restore_to_file(now, naive, tmp_path / "r.npy")["not_inverted"] == "crosstalk and afterpulse"
+    with pytest.warns(UserWarning, match="crosstalk and afterpulse not inverted, restored light is too bright"):
+        quiver.restore(stream, "naive")

@@ -1,13 +1,15 @@
 """Tests afterpulses and crosstalk: rates, margins, dead pixels, refusals."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from stats import assert_mean, assert_share
 
-from qsim.keys import Key
+from qsim.keys import Key, uniform, words
 from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.defects.correlated_noise import CorrelatedNoise
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import PERFECT, DarkSpread, FixedPattern, Maps, draw_maps
 from qsim.sensor.defects.pixel_array import PixelArray
@@ -106,6 +108,20 @@ def test_a_crop_with_a_margin_equals_the_frame(bits):
 def test_frames_of_a_disturbed_clip_all_differ():
     frames = sample(BinarySPAD(0.5, 0.0), np.full((20, 8, 10), 1.0), EXPOSURE, afterpulse=0.3, crosstalk=0.1)
     assert len({frame.tobytes() for frame in frames}) == 20
+
+
+@pytest.mark.parametrize("settings", [{"afterpulse": 0.3}, {"crosstalk": 0.3}])
+def test_stages_of_a_key_share_no_noise(settings):
+    """Training and validation windows differ in the stage of their keys only."""
+    codes = np.zeros((2, 20, 20), np.uint8)
+    codes[0] = 1
+    noise, keys = CorrelatedNoise(**settings), (replace(KEY, stage=stage) for stage in range(3))
+    stored, *windows = (noise.disturb(None, codes, 7, key, None, (0, 0))[0].astype(float) for key in keys)
+    for one, other in ((stored, windows[0]), (stored, windows[1]), (windows[0], windows[1])):
+        part = slice(1) if "crosstalk" in settings else slice(1, 2)
+        assert abs(np.corrcoef(one[part].ravel(), other[part].ravel())[0, 1]) < 5 / 20  # 5 sigma of 400 pixels
+    if "afterpulse" in settings:  # those of stored streams stay
+        np.testing.assert_array_equal(stored[1], uniform(words(replace(KEY, frame=1, stage=101), (20, 20))) < 0.3)
 
 
 @pytest.mark.parametrize(
