@@ -200,7 +200,7 @@ def test_a_damaged_ablation_is_refused_without_force(capsys, tiny_dataset, tmp_p
 
 
 def test_force_keeps_a_run_where_the_sensor_tells_nothing(capsys, tiny_dataset, tmp_path):
-    """The first window said so, when the run was gone."""
+    """The first window told it, when the run was gone."""
     words = ["train", tiny_dataset, "-o", tmp_path / "r", "--preset", "emvd", "--steps", 1, "--crop", 16, "--batch", 1]
     assert main([*map(str, words), "-q"]) == 0
     before = sha256(tmp_path / "r/best.safetensors")

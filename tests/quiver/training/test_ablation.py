@@ -6,6 +6,7 @@ import signal
 
 import pytest
 
+from quiver.cli.options import handling
 from quiver.cli.program import main
 from quiver.evaluation.comparison import ComparisonRow
 from quiver.evaluation.metrics import Score
@@ -48,5 +49,6 @@ def test_ctrl_c_ends_training_and_scoring(tiny_dataset, tmp_path, monkeypatch, c
         monkeypatch.setattr(ablation, name, lambda *words, **options: [])
     monkeypatch.setattr(ablation, place, stopped)
     words = ["--steps", "1", "--crop", "16", "--threads", "1", "-q"]
-    assert main(["ablate", str(tiny_dataset), "-o", str(tmp_path / "six"), *words]) == 130
+    with handling(signal.default_int_handler, signal.SIGINT):  # a shell's background jobs ignore the signal
+        assert main(["ablate", str(tiny_dataset), "-o", str(tmp_path / "six"), *words]) == 130
     assert "interrupted; the same command resumes" in capsys.readouterr().err
