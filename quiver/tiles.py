@@ -29,18 +29,21 @@ def extents(length: int, core: int, reach: int) -> list[tuple[int, int]]:
     return [(max(0, start - reach), min(length, start + core + reach)) for start in range(0, length, core)]
 
 
-def cores(height: int, width: int, pixels: int, reach: int, multiple: int) -> tuple[int, int]:
+def cores(height: int, width: int, pixels: int, reach: int, multiple: int, least: int = 1) -> tuple[int, int]:
     """Return height and width of the cores whose tiles hold at most `pixels` pixels and have the smallest total area.
 
-    `multiple` divides reach and cores. `ValueError` if the smallest tile does not fit.
+    `multiple` divides reach and cores. A side below `least` counts as `least`: the network fills it. `ValueError` if
+    the smallest tile does not fit.
     """
-    if height * width <= pixels:
+    if max(height, least) * max(width, least) <= pixels:
         return height, width
     found = []
     for length in (height, width):
         tried = np.arange(multiple, length + multiple, multiple)
         ends = [extents(length, int(core), reach) for core in tried]
-        found.append((tried, *(np.array([kind(b - a for a, b in spans) for spans in ends]) for kind in (max, sum))))
+        found.append(
+            (tried, *(np.array([kind(max(b - a, least) for a, b in spans) for spans in ends]) for kind in (max, sum)))
+        )
     (tall, most_y, all_y), (wide, most_x, all_x) = found
     area = np.where(most_y[:, None] * most_x <= pixels, all_y[:, None] * all_x, np.iinfo(np.int64).max)
     y, x = np.unravel_index(np.argmin(area), area.shape)
@@ -72,14 +75,14 @@ def spans(length: int, core: int, reach: int, blend: bool) -> list[tuple[int, Ar
 
 
 def cut_tiles(
-    height: int, width: int, pixels: int, reach: int, multiple: int = 1, *, blend: bool = False
+    height: int, width: int, pixels: int, reach: int, multiple: int = 1, *, blend: bool = False, least: int = 1
 ) -> list[Tile]:
     """Return tiles of at most `pixels` pixels that start at multiples of `multiple`; one tile if the frame fits.
 
-    `ValueError` if the smallest tile does not fit.
+    A side below `least` counts as `least`. `ValueError` if the smallest tile does not fit.
     """
     reach = -(-reach // multiple) * multiple
-    tall, wide = cores(height, width, pixels, reach, multiple)
+    tall, wide = cores(height, width, pixels, reach, multiple, least)
     return [
         Tile(y, x, rows[:, None] * columns[None, :])
         for y, rows in spans(height, tall, reach, blend)

@@ -56,16 +56,13 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces
     least = int(getattr(model, "least", 1))  # px: smaller tiles are filled to this side
     if max(height, least) * max(width, least) <= pixels:
         return Pieces(cut_tiles(height, width, height * width, 0))
-    if least * least > pixels:
-        raise ValueError(
-            f"the memory bound holds {pixels} pixels at a time; a tile needs at least {least} x {least}; raise --memory"
-        )
     reach = getattr(model, "reach", None)
     if reach is not None:
         return Pieces(cut_tiles(height, width, pixels, reach, int(model.multiple)))  # type: ignore[arg-type]
     if takes_clips(model):  # recurrent, or aligned along any motion: no overlap makes tiles exact
         needed = bytes_needed(model, height, width)
-        return Pieces(cut_tiles(height, width, pixels, BLENDED, STEP, blend=True), False, needed, stated)
+        tiles = cut_tiles(height, width, pixels, BLENDED, STEP, blend=True, least=least)
+        return Pieces(tiles, False, needed, stated)
     multiple, needed = int(model.multiple), bytes_needed(model, height, width)  # type: ignore[arg-type]
     if not isinstance(model, QUIVER):
         return Pieces(cut_tiles(height, width, pixels, BLENDED, multiple, blend=True), False, needed, stated)

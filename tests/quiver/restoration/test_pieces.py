@@ -56,6 +56,12 @@ def test_tiles_that_rvrt_would_fill_are_refused():
     with pytest.raises(ValueError, match=r"a tile needs at least 132 x 132; raise --memory$"):
         cut_pieces(network, 64, 64, 200_000_000)
     assert cut_pieces(network, 64, 64, bytes_needed(network, 132, 132)).exact
+    rng = np.random.default_rng(3)
+    for _ in range(40):
+        height, width = (int(side) for side in rng.integers(20, 700, 2))
+        pixels = int(rng.integers(132**2, 60_000))
+        for tile in cut_pieces(network, height, width, bytes_needed(network, 1, pixels)).tiles:
+            assert np.prod([max(side, 132) for side in tile.weight.shape]) <= pixels
 
 
 @pytest.mark.parametrize(
