@@ -225,7 +225,10 @@ def make_row(
 
 
 def check_row(path: Path, budget: Budget, data: Path) -> None:
-    """Raise `ValueError` if a row was made with another budget or on another data set, or an error if it is missing."""
+    """Raise `ValueError` if a row was made with another budget or on another data set.
+
+    `FileNotFoundError` if there is no such data set.
+    """
     found = read_json(path)
     wanted = {"budget": asdict(budget), "data": data.name, "recipe_sha256": recipe_digest(data)}
     for name, value in wanted.items():

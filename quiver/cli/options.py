@@ -69,17 +69,19 @@ def add_noise(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sensor",
         type=words,
-        help="names of `qsim doctor --devices` or .toml files, comma-separated (default: the protocol's, as mergenet "
-        "has them, else the data set's streams')",
+        help="names of `qsim doctor --devices` or .toml files, comma-separated (default: the protocol's, which "
+        "mergenet states, else those of the data set's streams)",
     )
     parser.add_argument(
         "--ppp",
         type=light_levels,
         help=f"mean photons per pixel and exposure; several: 1,10, or {LEVELS} in a range: 0.3..100 (default: the "
-        "protocol's, else the streams')",
+        "protocol's, else those of the streams)",
     )
     parser.add_argument(
-        "--bits", type=whole_numbers, help="bits per code; several: 1,3 (default: the protocol's, else the streams')"
+        "--bits",
+        type=whole_numbers,
+        help="bits per code; several: 1,3 (default: the protocol's, else those of the streams)",
     )
 
 
@@ -88,7 +90,7 @@ def add_running(parser: argparse.ArgumentParser, *, resumed: bool = True) -> Non
     parser.add_argument(
         "--memory",
         type=memory_size,
-        help="working memory, as in 500MB (default 2GB; of a network but mergenet on a GPU half of the GPU's)",
+        help="working memory, as in 500MB (default 2GB; on a GPU half of its memory for networks other than mergenet)",
     )
     parser.add_argument("--mode", choices=MODES, help="networks: how frames share work (default exact)")
     parser.add_argument("--device", choices=DEVICES, help="networks: where they run (default auto)")
