@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from qsim.files import VERSION, lazy_names
+from qsim.files import VERSION
+from qsim.lazy_imports import lazy_names
 
 if TYPE_CHECKING:
     from qsim.calibration.qis import calibrate_qis

@@ -18,7 +18,7 @@ import re
 import shutil
 import warnings
 from collections.abc import Callable, Iterator
-from importlib import import_module, metadata
+from importlib import metadata
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
@@ -263,21 +263,6 @@ def remove_folder(folder: Path) -> None:
     doomed = folder.with_name(f"{folder.name}.removed-{os.getpid()}")
     os.replace(folder, doomed)
     shutil.rmtree(doomed)
-
-
-def lazy_names(package: str, homes: dict[str, str]) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a package that imports each public name from its module when it is first used.
-
-    `homes` maps names to modules; "module:other" if the name is `other` there.
-    """
-
-    def get(name: str) -> Any:
-        if name not in homes:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module, _, other = homes[name].partition(":")
-        return getattr(import_module(f"{package}.{module}"), other or name)
-
-    return get
 
 
 def check_name(name: Any) -> str:

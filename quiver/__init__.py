@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from qsim.files import lazy_names
+from qsim.lazy_imports import lazy_names
 
 if TYPE_CHECKING:
     from quiver.data.windows import windows

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from qsim.files import lazy_names
+from qsim.lazy_imports import lazy_names
 
 if TYPE_CHECKING:
     from qsim.clip.clip import Clip

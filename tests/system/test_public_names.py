@@ -67,3 +67,12 @@ def test_the_version_of_a_source_tree_without_installation_is_read_from_it():
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert found.stdout.strip() == qsim.__version__
+
+
+@pytest.mark.parametrize("name", ["qsim.optics.RGB", "qsim.sensor.devices.load", "quiver.data.codes", "quiver.threads"])
+def test_modules_are_imported_by_their_dotted_names(name: str):
+    """Pages name them so; without another import before they were no attributes."""
+    program = f"import {name.partition('.')[0]}; print({name})"
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout
+    with pytest.raises(AttributeError, match="module 'qsim' has no attribute 'nothing'"):
+        _ = qsim.nothing
