@@ -2,15 +2,15 @@
 
 from typing import TYPE_CHECKING
 
-from qsim.files import lazy_names
+from qsim.lazy_imports import lazy_names
 
 if TYPE_CHECKING:
-    from qsim.calibration.frame_statistics import FrameStatistics
+    from qsim.calibration.frame_statistics import FrameStatistics, measure, measure_sums
     from qsim.calibration.qis import calibrate_qis
     from qsim.calibration.results import Calibration
     from qsim.calibration.spad import calibrate_spad
 
-__all__ = ["Calibration", "FrameStatistics", "calibrate_qis", "calibrate_spad"]
+__all__ = ["Calibration", "FrameStatistics", "calibrate_qis", "calibrate_spad", "measure", "measure_sums"]
 
 __getattr__ = lazy_names(
     __name__,
@@ -19,5 +19,7 @@ __getattr__ = lazy_names(
         "FrameStatistics": "frame_statistics",
         "calibrate_qis": "qis",
         "calibrate_spad": "spad",
+        "measure": "frame_statistics",
+        "measure_sums": "frame_statistics",
     },
 )

@@ -214,10 +214,16 @@ def alike(stack: FrameStatistics) -> bool:
     return stack.frames > 1 and not stack.pixel_variance.any()
 
 
-def check_stacks(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics]) -> None:
-    """`ValueError` unless there are stacks, all of one size."""
+def check_stacks(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], bits: int) -> None:
+    """`ValueError` unless there are stacks, all of one size and of codes of so many bits."""
     if not darks and not flats:
         raise ValueError("calibrate: no frames at all; give dark and flat frames")
     shapes = {stack.total.shape for stack in (*darks, *flats)}
     if len(shapes) > 1:
         raise ValueError(f"calibrate: stacks of different sizes {sorted(shapes)}; use the same part of the sensor")
+    for stack in (*darks, *flats):
+        if stack.histogram.size != 1 << bits:
+            measured = stack.histogram.size.bit_length() - 1
+            raise ValueError(
+                f"calibrate: bits={bits}, and a stack was measured with bits={measured}; give both the same"
+            )

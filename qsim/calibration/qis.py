@@ -29,7 +29,7 @@ def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatist
     Values named `..._transfer` come from means and variances, the others from the histograms. `ValueError` if there is
     no dark or no flat stack, or if a stack is constant or its frames are all alike.
     """
-    check_stacks(darks, flats)
+    check_stacks(darks, flats, bits)
     if bits < 2:
         raise ValueError(
             "calibrate: 1 bit per code cannot tell gain, offset and read noise apart; calibrate binary planes with "

@@ -68,7 +68,7 @@ def _blocks(
     if stream is not None and width not in (None, stream.shape[2]):
         raise ValueError(f"{path}: is a stream of {stream.shape[2]} pixels per row, not {width}; leave --width out")
     if stream is not None or (path.suffix == ".npy" and width is None):
-        return _array_blocks(read_counts(path, bits=bits))
+        return _array_blocks(read_counts(path, bits=bits, exposure=exposure * (planes or 1)))
     if path.suffix == ".mat":
         if width is not None:
             raise ValueError(f"{path}: --width acts on packed planes, and a .mat has one value per pixel; leave it out")
@@ -107,10 +107,13 @@ def _photon_codes(path: Path, bits: int, exposure: float, planes: int | None) ->
     return np.asarray(photons.clocked(parts).reshape(-1, parts, *photons.shape[1:]).sum(axis=1))
 
 
-def read_counts(path: Path, variable: str | None = None, bits: int | None = None) -> Array:
+def read_counts(
+    path: Path, variable: str | None = None, bits: int | None = None, exposure: float | None = None
+) -> Array:
     """Return the frames [T, H, W] of an `.npy`, mapped, of a stream, read when they are used, or of a `.mat`.
 
-    `ValueError` or `FileNotFoundError` naming the file, also for a stream of other `bits`.
+    `ValueError` or `FileNotFoundError` naming the file, also for a stream of other `bits`, or whose codes have another
+    `exposure` [s].
     """
     if path.suffix == ".mat":
         return mat_array(path, variable)
@@ -120,6 +123,11 @@ def read_counts(path: Path, variable: str | None = None, bits: int | None = None
     if stream is not None:
         if bits not in (None, stream.bits):
             raise ValueError(f"{path}: is a stream of {stream.bits} bits per code, not {bits}; give what it states")
+        if exposure is not None and not math.isclose(exposure, stream.exposure, rel_tol=1e-3):  # typed by hand
+            raise ValueError(
+                f"{path}: is a stream of codes of {stream.exposure:g} s, not of {exposure:g} s; give what it states, "
+                "or convert it again with the true --exposure"
+            )
         return cast(Array, stream.codes)
     array = load_array(path)
     array = array[None] if array.ndim == 2 else array

@@ -44,7 +44,7 @@ def calibrate_spad(
     `dead_time=False` assumes Poisson counts; the p-value shows whether that holds. Without `darks` the DCR is assumed
     to be 0, with a warning. `flats` may be missing; `ValueError` if both are, and for stacks that determine nothing.
     """
-    check_stacks(darks, flats)
+    check_stacks(darks, flats, bits)
     check_noise(darks, flats)
     warnings = _dispersed([*darks, *flats])
     values: dict[str, Value] = {}

@@ -31,7 +31,9 @@ def add_calibrate(sub: Any) -> None:
         help="counts of a static scene, instead of dark and flat frames: measures the dead time from Fano factors",
     )
     parser.add_argument(
-        "--bits", type=checked(checks.bits), help="bits per code; 1 for binary planes (default with --planes: 1)"
+        "--bits",
+        type=checked(checks.bits),
+        help="bits per code; 1 for binary planes (default with --planes of 2 or more: 1)",
     )
     parser.add_argument(
         "--planes",
@@ -70,7 +72,9 @@ def _run_calibrate(args: argparse.Namespace) -> int:
             darks, flats, bits=bits, dead_time=not args.ignore_dead_time, paralyzable=args.paralyzable
         )
     args.output.parent.mkdir(parents=True, exist_ok=True)
-    written = sensor_file.write(found, args.output, f"calibrated from {len(darks)} dark and {len(flats)} flat stacks")
+    stacks = f"{len(darks)} dark and {len(flats)} flat stacks"
+    origin = f"counts of the static scene {Path(args.static[0]).name}" if args.static else stacks
+    written = sensor_file.write(found, args.output, f"calibrated from {origin}")
     width = max(len(name) for name in found.values)
     assumed = _assumed(args, model, bits)
     text = [f"taken as: {assumed}"]
@@ -154,11 +158,9 @@ def _static(args: argparse.Namespace, bits: int) -> Any:
     from qsim.calibration.dead_time import calibrate_static
     from qsim.calibration.sensor_file import read_counts
 
-    path = Path(args.static[0])
-    counts = read_counts(path, args.variable, bits)
-    return calibrate_static(
-        counts, bits=bits, exposure=_number(args.static[1]), paralyzable=args.paralyzable, name=str(path)
-    )
+    path, exposure = Path(args.static[0]), _number(args.static[1])
+    counts = read_counts(path, args.variable, bits, exposure)
+    return calibrate_static(counts, bits=bits, exposure=exposure, paralyzable=args.paralyzable, name=str(path))
 
 
 def _number(word: str) -> float:

@@ -283,6 +283,8 @@ def _with_gain(settings: dict[str, object], where: str) -> dict[str, object]:
     """
     if "iso" not in settings:
         return settings
+    if "bits" not in settings:
+        raise ValueError(f"{where}: bits is missing; iso states the gain of a code of so many bits")
     numbers = {}
     for key in ("iso", "full_well", "bits", "offset"):
         value = settings.get(key, 0.0)

@@ -5,6 +5,8 @@ import pytest
 from synthetic import PLANE
 
 from qsim.calibration.frame_statistics import measure, measure_sums
+from qsim.calibration.qis import calibrate_qis
+from qsim.calibration.spad import calibrate_spad
 
 H, W = PLANE
 
@@ -64,3 +66,12 @@ def test_values_above_the_planes_name_their_place():
         measure_sums([np.zeros((1, H, W), int), np.full((1, H, W), 5)], planes=4, exposure=1e-5, photons=None)
     with pytest.raises(ValueError, match="sums of N binary planes are calibrated with --planes N"):
         measure([np.full((1, H, W), 19)], bits=1, exposure=1e-5, photons=None)
+
+
+def test_stacks_of_other_bits_are_refused():
+    """Eight bits calibrated as one gave a wrong efficiency, without an error."""
+    frames = np.random.default_rng(0).integers(0, 200, (4, 6, 7))
+    stacks = [measure(frames, bits=8, exposure=1e-3, photons=photons) for photons in (0.0, 50.0)]
+    for calibrate, bits in ((calibrate_spad, 1), (calibrate_qis, 10)):
+        with pytest.raises(ValueError, match=f"bits={bits}, and a stack was measured with bits=8; give both the same"):
+            calibrate(stacks[:1], stacks[1:], bits=bits)

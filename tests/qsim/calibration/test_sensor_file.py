@@ -106,3 +106,18 @@ def test_parameters_that_were_not_measured_are_named():
     assert not any("dead time is not measured" in words for words in ignored.warnings)
     flat = calibrate_spad([], [statistics_of(counts, 8, None)], bits=8)
     assert 'dark_count_rate = "0, not measured"' in to_toml(flat, "a test")
+
+
+def test_a_stream_has_the_exposure_that_it_states(tmp_path):
+    """Dark counts of codes of 0.5 ms were divided by the 1 ms that was typed."""
+    clip = write_clip(tmp_path / "c", frames=8, height=6, width=7)
+    stream = clip.sense("spad-320x240", ppp=1.0, bits=1, name="s")
+    side = stream.path.with_suffix(".json")
+    for path in (stream.path, side):
+        with pytest.raises(ValueError, match=r"a stream of codes of 0\.0005 s, not of 0\.001 s; give what it states"):
+            read_stack(path, bits=1, exposure=1e-3, photons=0.0)
+    sums = clip.sense("spad-320x240", ppp=1.0, bits=3, name="sums")
+    found = read_stack(sums.path, bits=3, exposure=5e-4 / 7, photons=0.0, planes=7)
+    assert found.exposure == pytest.approx(5e-4 / 7)
+    with pytest.raises(ValueError, match=r"is a stream of codes of 0\.0005 s"):
+        read_stack(sums.path, bits=3, exposure=5e-4, photons=0.0, planes=7)

@@ -215,6 +215,7 @@ def test_iso_is_a_gain_at_which_a_share_of_the_full_well_fills_the_code(tmp_path
         ("iso = 100", "iso = true", "iso is a number, got True"),
         ("iso = 100", "iso = 100\ngain = 1.0", "leave one of iso and gain out"),
         ('"QIS"', '"SpikeCamera"', "iso states the gain of a QIS"),
+        ("bits = 12\n", "", "bits is missing; iso states the gain of a code of so many bits"),
         ("full_well = 8000.0\n", "", "iso needs a full_well above 0"),
         ("offset = 0.0", "offset = 5000.0", "codes above the offset"),
         ("bits = 12", "bits = 99999999999", "bits"),
