@@ -76,6 +76,7 @@ class Codes:
     shares: tuple[float, ...] | None = None  # exposures of codes in turn, over `exposure`; None: all are full
     defective: Array | None = field(default=None, compare=False)  # bool [H, W]; pixels that `read` fills from others
     colour: ColourFilter | None = None  # over the pixels, from the first one on; None: all see one band
+    source_sha256: str | None = None  # of a stored stream's codes as its description states it
     not_inverted: str = ""  # defects that add detections, which the sensor's response leaves out: crosstalk, afterpulse
 
     @property
@@ -221,7 +222,8 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
     """
     sensing = light.sensing(seed)
     draw, _ = followed(clip, sensing, light.draw(clip, seed))
-    bad = defects.of_draw(draw, clip.exposure, (clip.shape[1], clip.shape[2]))
+    shape = clip.shape[1], clip.shape[2]
+    bad = defects.of_draw(draw, clip.exposure, shape)
 
     @cache
     def complete() -> Array:
@@ -236,7 +238,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
     codes = Codes(
         name=f"{clip.name}, {light.label}",
         shape=clip.shape,
-        sensor=defects.behind(bad, draw.defects, draw.sensor, draw.origin),
+        sensor=defects.behind(bad, draw.defects, draw.sensor, shape, draw.origin),
         exposure=clip.exposure,
         frame_rate=clip.frame_rate,
         read=read,
@@ -252,9 +254,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
 
 def stream_codes(stream: Stream) -> Codes:
     """Return the codes of a stored stream; its dead and hot pixels, where it states them, are filled."""
-    meta, bad, sensor = stream.meta, defects.of_stream(stream), stream.sensor
-    if bad is not None:
-        sensor = defects.behind(bad, defects.read_defects(meta["defects"]), sensor, stream.origin)
+    meta, (bad, sensor) = stream.meta, defects.of_stream(stream)
     codes = Codes(
         stream.name,
         stream.shape,
@@ -268,6 +268,7 @@ def stream_codes(stream: Stream) -> Codes:
         meta.get("ppp"),
         stream.shares,
         colour=stream.colour_filter,
+        source_sha256=meta.get("sha256"),
         not_inverted=_not_inverted(meta.get("defects") or {}),
     )
     return filled(codes, bad)
@@ -291,9 +292,10 @@ def codes_of(stream: Stream) -> Codes:
 def repaired(codes: Codes, found: defects.Defects | None) -> Codes:
     """Return the codes of a sensor with these defects: dead and hot pixels filled, the dark rate that of the others."""
     left = _not_inverted(vars(found) if found else {})
-    codes = replace(codes, sensor=defects.as_measured(found, codes.sensor, codes.shape[1:]), not_inverted=left)
-    bad = defects.defective(found, codes.sensor, codes.exposure, light_of(codes), codes.shape[1:])
-    return filled(replace(codes, sensor=defects.behind(bad, found, codes.sensor)), bad)
+    shape = codes.shape[1:]
+    codes = replace(codes, sensor=defects.behind(None, found, codes.sensor, shape), not_inverted=left)
+    bad = defects.defective(found, codes.sensor, codes.exposure, light_of(codes), shape)
+    return filled(replace(codes, sensor=defects.behind(bad, found, codes.sensor, shape)), bad)
 
 
 def _not_inverted(table: Mapping[str, Any]) -> str:

@@ -25,11 +25,9 @@ from qsim import files, keys
 from qsim.clip.simulation import Draw
 from qsim.clip.stream import Stream
 from qsim.keys import Key
-from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.defect_table import Defects as Defects
 from qsim.sensor.defects.defect_table import from_dict as read_defects
-from qsim.sensor.defects.good_pixels import behind as behind
-from qsim.sensor.defects.good_pixels import defective
-from qsim.sensor.defects.pixel_array import PixelArray
+from qsim.sensor.defects.good_pixels import behind, defective
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 
@@ -77,29 +75,28 @@ def skips_codes(sensor: Sensor) -> bool:
     return isinstance(sensor, QIS) and sensor.gain * (1 - 2 * REACH * sensor.read_noise) > 1
 
 
-def as_measured(defects: Defects | None, sensor: Sensor, shape: tuple[int, int]) -> Sensor:
-    """Return a sensor with the mean dark rate of its measured map for frames [H, W]; the same without a map."""
-    return sensor if defects is None else PixelArray.of(defects, sensor, *shape).sensor
-
-
 def of_draw(draw: Draw, exposure: float, shape: tuple[int, int]) -> Array | None:
     """Return the defective pixels of a clip that is sensed now."""
     light = draw.level.ppp * draw.planes
     return defective(draw.defects, draw.sensor, exposure * draw.planes, light, shape, draw.origin)
 
 
-def of_stream(stream: Stream) -> Array | None:
-    """Return the defective pixels that the description of a stream states; a warning where a map is missing."""
+def of_stream(stream: Stream) -> tuple[Array | None, Sensor]:
+    """Return the defective pixels that the description of a stream states, and the sensor of its good pixels.
+
+    A warning where a map is missing.
+    """
     table, ppp = stream.meta.get("defects"), stream.meta.get("ppp")
     if table is None or ppp is None:
-        return None
+        return None, stream.sensor
     _, height, width = stream.shape
     try:
         found = read_defects(table)
-        return defective(found, stream.sensor, stream.exposure, float(ppp), (height, width), stream.origin)
+        bad = defective(found, stream.sensor, stream.exposure, float(ppp), (height, width), stream.origin)
+        return bad, behind(bad, found, stream.sensor, (height, width), stream.origin)
     except (OSError, ValueError) as error:
         warnings.warn(f"{stream.path}: its hot and dead pixels are not filled: {files.wording(error)}", stacklevel=2)
-        return None
+        return None, stream.sensor
 
 
 def read_map(path: Path) -> Array:

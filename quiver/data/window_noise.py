@@ -74,7 +74,7 @@ def behind_defects(noise: Noise, draw: Draw, clip: Clip) -> tuple[Array | None, 
     table = stored_defects(noise.defects)
     shape = clip.shape[1], clip.shape[2]
     bad = defective(table, draw.sensor, clip.exposure, draw.level.ppp, shape, draw.origin)
-    return bad, behind(bad, table, draw.sensor, draw.origin)
+    return bad, behind(bad, table, draw.sensor, shape, draw.origin)
 
 
 def window_filler(bad: Array | None, place: WindowPlace, side: int, sensor: Sensor) -> Filler | None:

@@ -45,18 +45,25 @@ def defective(
     return bad if bad.any() else None
 
 
-def behind(bad: Array | None, defects: Defects | None, sensor: Sensor, origin: tuple[int, int] = (0, 0)) -> Sensor:
-    """Return the sensor of filled codes: its dark rate is the mean of the good pixels, bool [H, W] `bad` being false.
+def behind(
+    bad: Array | None,
+    defects: Defects | None,
+    sensor: Sensor,
+    shape: tuple[int, int],
+    origin: tuple[int, int] = (0, 0),
+) -> Sensor:
+    """Return the sensor of filled codes: its dark rate is the mean of the good pixels of its frames [H, W].
 
-    The mean over all pixels belongs mostly to the hot ones. Restored light would be too dark by their share of it.
+    `bad`, bool [H, W], is true at the others; None: all are good. The mean over all pixels, or over those of a measured
+    map that the frames do not cover, belongs mostly to hot ones: restored light would be too dark by their share of it.
     """
-    if bad is None or defects is None:
+    if defects is None:
         return sensor
-    height, width = bad.shape
-    array = PixelArray.of(defects, sensor, height, width, origin)
-    if array.maps.dark is None or bad.all():
+    good = np.ones(shape, bool) if bad is None else ~bad
+    array = PixelArray.of(defects, sensor, *shape, origin)
+    if array.maps.dark is None or not good.any():
         return sensor
-    return sensor.with_dark_rate(array.sensor.dark_rate * float(array.maps.dark[~bad].mean()))
+    return sensor.with_dark_rate(array.sensor.dark_rate * float(array.maps.dark[good].mean()))
 
 
 def of_stream(sensor: Sensor, meta: Mapping[str, Any]) -> tuple[Sensor, str]:
@@ -73,7 +80,7 @@ def of_stream(sensor: Sensor, meta: Mapping[str, Any]) -> tuple[Sensor, str]:
         y, x = meta.get("origin") or (0, 0)
         if ppp is not None:
             bad = defective(found, sensor, float(meta["exposure"]), float(ppp), (height, width), (y, x))
-            sensor = behind(bad, found, sensor, (y, x))
+            sensor = behind(bad, found, sensor, (height, width), (y, x))
     except (OSError, ValueError) as error:  # a measured map is missing or has changed
         return sensor, f"no defect is inverted: {files.wording(error)}"
     return sensor, f"not inverted: {', '.join(left)}"

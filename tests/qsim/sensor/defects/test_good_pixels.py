@@ -7,7 +7,8 @@ import pytest
 from clips import write_clip
 from sensor_files import QIS, SPAD, sensor_file
 
-from qsim.sensor.defects import good_pixels
+from qsim.sensor import devices
+from qsim.sensor.defects import defect_table, good_pixels
 
 PPP, SIZE, HOT = 3.0, (40, 40), slice(None, None, 101)  # 1 % of the pixels are hot
 
@@ -50,3 +51,18 @@ def test_the_rest_is_named(tmp_path):
 def test_a_stream_without_defects_keeps_its_sensor(tmp_path):
     stream = write_clip(tmp_path / "c", frames=2, height=6, width=7).sense("spad512s", ppp=1.0, name="s")
     assert good_pixels.of_stream(stream.sensor, stream.meta) == (stream.sensor, "")
+
+
+@pytest.mark.parametrize("origin", [(0, 0), (7, 3)])
+def test_a_map_larger_than_the_frames_gives_the_rate_of_those_it_covers(tmp_path, origin):
+    """Hot pixels lie outside of the frames alone: their dark counts were taken off everywhere, one per frame."""
+    height, width = 20, 24
+    rates = np.full((60, 70), 2e5)
+    rates[: origin[0] + height, : origin[1] + width] = 20.0
+    np.save(tmp_path / "rates.npy", rates)
+    table = defect_table.from_toml(sensor_file(tmp_path, f'{QIS}dark_map = "rates.npy"\n', bits=4))
+    sensor = devices.load(tmp_path / "mine.toml")
+    bad = good_pixels.defective(table, sensor, 5e-4, PPP, (height, width), origin)
+    assert bad is None
+    found = good_pixels.behind(bad, table, sensor, (height, width), origin)
+    assert found.dark_rate == pytest.approx(20.0)
