@@ -136,7 +136,7 @@ def steps(text: str) -> list[float]:
             low, high = float(words[0]), float(words[1])
             count = int(words[2]) if len(words) == 3 else _doublings(low, high)
             found = [float(f"{v:.4g}") for v in np.geomspace(low, high, count)]
-    except (ValueError, IndexError):
+    except (ValueError, IndexError, ZeroDivisionError):
         found = []
     if not found or len(words) > 3 or not all(0 < v < float("inf") for v in found):
         raise argparse.ArgumentTypeError(

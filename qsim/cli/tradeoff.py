@@ -70,7 +70,7 @@ def _run_tradeoff(args: argparse.Namespace) -> int:
         if args.source is not None:
             raise ValueError(f"{args.source}: --table is computed without a clip; leave the clip or scene out")
         idle = [name for name in OF_STUDIES if name not in ("bits", "base_fps")]
-        refuse_idle(args, "tradeoff --table", ["paper_figure", *idle, *OF_FILES])
+        refuse_idle(args, "tradeoff --table", ["paper_figure", *idle, *OF_FILES, "threads"])
         return _tradeoff_table(args)
     name = "tradeoff" if args.paper_figure is None else f"figure{args.paper_figure}"
     if args.paper_figure is not None:
@@ -94,6 +94,7 @@ def _run_tradeoff(args: argparse.Namespace) -> int:
 
 
 def _tradeoff_study(args: argparse.Namespace) -> int:
+    from qsim.clip.motion_statistics import SLOWEST
     from qsim.studies.bit_depth import clips as study_clips
     from qsim.studies.bit_depth import figures, speed_sweep
     from qsim.studies.bit_depth.answer import WIDEST, answer, widened
@@ -108,6 +109,11 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     widen = args.bits is None
     frames = args.frames or (2**WIDEST - 1 if widen else max(4 * settings.longest, 32))
     rate = 10_000.0 if args.base_fps is None else args.base_fps
+    if not (Path(args.source) / "clip.json").is_file():  # refused before anything is rendered
+        if rate < SLOWEST:
+            raise ValueError(f"--base-fps {rate:g}: this study needs at least {SLOWEST:g} planes per second")
+        if frames < settings.longest:
+            raise ValueError(f"--frames {frames}: {max(bits)} bits need {settings.longest}; give more, or fewer bits")
     shape = study_clips.ClipShape(frames, height, width, rate, seed=args.seed)
     speeds, text = _speeds(args, shape)
     levels = args.ppp or [None]

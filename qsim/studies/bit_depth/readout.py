@@ -155,12 +155,21 @@ def _of_file(name: str) -> Sensor:
 def plane_sensor(settings: StudySettings, ppp: float, exposure: float) -> Sensor:
     """Return the sensor of one binary plane; raise `ValueError` if the named one has more than one bit.
 
-    Unless one is named, efficiency and dark rate are those of the multi-bit read, whatever its bits.
+    Unless one is named, efficiency and dark rate are those of the multi-bit read, whatever its bits. `ValueError` too
+    where this read has dark electrons per frame, so that no plane has its rate.
     """
     if settings.plane is not None:
         return at_depth(settings.plane, 1, ppp, exposure)
     file = settings.sensor.endswith(".toml")
-    read = _of_file(settings.sensor) if file else devices.load(settings.sensor, ppp=ppp, exposure=exposure)
+    read, longer = (
+        _of_file(settings.sensor) if file else devices.load(settings.sensor, ppp=ppp, exposure=seconds)
+        for seconds in (exposure, 2 * exposure)
+    )
+    if read.dark_rate != longer.dark_rate:
+        raise ValueError(
+            f"{settings.sensor}: its dark electrons are per frame, whatever the exposure, so that planes have no dark "
+            "rate; name their sensor with --plane-sensor, or take quiver-physical"
+        )
     return BinarySPAD(read.efficiency, read.dark_rate, 1)
 
 

@@ -116,6 +116,7 @@ def test_bits_that_were_given_are_kept_and_others_widened(clip, capsys):
         ("--table --streams", "tradeoff --table: --streams changes nothing here"),
         ("--table -o x", "tradeoff --table: --output changes nothing here"),
         ("--table --force", "tradeoff --table: --force changes nothing here"),
+        ("--table --threads 1", "tradeoff --table: --threads changes nothing here"),
         ("--table --paper-figure 1", "tradeoff --table: --paper-figure changes nothing here"),
         ("CLIP --ppp 1 --read-noise 0", "tradeoff of a clip or scene: --read-noise changes nothing here"),
         ("CLIP --ppp 1 --motion 10", "tradeoff of a clip or scene: --motion changes nothing here"),
@@ -178,3 +179,29 @@ def test_a_spike_camera_is_refused_before_anything_is_rendered(tmp_path, capsys,
     assert main(words) == 2
     assert "spike.toml: planes of a spike camera depend on each other" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--ppp 0:30", "expected numbers above 0"),
+        ("--speed 0:8", "expected numbers above 0"),
+        ("--px 3:0", "expected numbers above 0"),
+        ("--base-fps 5000", "--base-fps 5000: this study needs at least 10000 planes per second"),
+        ("--bits 1,5 --frames 30", "--frames 30: 5 bits need 31; give more, or fewer bits"),
+        ("--sensor quiver-published", "quiver-published: its dark electrons are per frame"),
+    ],
+)
+def test_what_no_study_can_use_is_refused_before_rendering(capsys, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("qsim.studies.bit_depth.clips.render", lambda *_, **__: pytest.fail("a clip was rendered"))
+    assert main(["tradeoff", "fan", *words.split(), "-o", "x"]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_planes_of_a_sensor_with_dark_electrons_per_frame_are_named(clip, capsys):
+    words = ["tradeoff", str(clip.path), "--ppp", "0.65", "--bits", "1,2", "--sensor", "quiver-published"]
+    assert main([*words, "--plane-sensor", "spad-320x240"]) == 0
