@@ -85,10 +85,13 @@ def recordings(folder: Path, layout: str | None) -> list[Path]:
         videos = sorted(file for file in files if file.suffix.lower() in VIDEOS)
         if videos or layout == "video":
             return videos
-    if any(item.is_file() and (item.suffix.lower() in PARTS or item.name in ZARR) for item in folder.iterdir()):
-        return []
     kinds = (layout,) if layout else ("png", "tiff")
     places = {file.parent for file in files if PICTURES.get(file.suffix.lower()) in kinds}
+    if any(item.is_file() and (item.suffix.lower() in PARTS or item.name in ZARR) for item in folder.iterdir()):
+        if folder in places and len(places) > 1:
+            inner = min(places - {folder})
+            raise ValueError(f"{folder}: holds pictures and folders of pictures ({inner}); move one of them away")
+        return []
     return sorted(place for place in places if not any(place.glob("*.npy")))
 
 
@@ -115,10 +118,15 @@ def _detect_folder(path: Path) -> str:
         return "zarr"
     if (path / "info.json").is_file() or any(path.glob("part_*.mat")):
         return "mat"
-    for pattern, layout in (("*.png", "png"), ("*.tif*", "tiff")):
-        if any(path.glob(pattern)):
-            return layout
-    if any(path.rglob("*.bin")):
+    shown = sorted(file for file in path.iterdir() if file.suffix.lower() in PICTURES and file.name[0] != ".")
+    raw = sorted(path.rglob("*.bin"))
+    kinds = {PICTURES[file.suffix.lower()]: file for file in shown} | ({"raw": raw[0]} if raw else {})
+    if len(kinds) > 1:
+        first, second, *_ = kinds.values()
+        raise ValueError(f"{path}: holds recordings of two kinds ({first}, {second}); choose with --layout")
+    if shown:
+        return PICTURES[shown[0].suffix.lower()]
+    if raw:
         return _detect_raw(raw_cameras.raw_files(path)[0], many=True)
     raise ValueError(f"{path}: a folder of unknown kind; name it with `qsim convert --layout`: {', '.join(LAYOUTS)}")
 

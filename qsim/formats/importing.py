@@ -171,6 +171,9 @@ def to_stream(
         raise ValueError(f"{path}: --split is stored in clips, and {recording.source} becomes a stream; leave it out")
     if capture.ppp is not None and capture.sensor is None:
         raise ValueError(f"{path}: --ppp sets the gain of a named sensor; name it with --sensor, or leave --ppp out")
+    device = devices.DEVICES.get(str(capture.sensor))
+    if capture.ppp is not None and not (device is not None and device.follows_light):
+        raise ValueError(f"{path}: --ppp changes nothing for {capture.sensor}, whose gain is fixed; leave it out")
     check_outside(path)
     stem = path.with_suffix("") if path.suffix in (".npy", ".json") else path
     npy, description = (stem.with_name(f"{stem.name}{end}") for end in (".npy", ".json"))  # a stem may hold dots

@@ -227,7 +227,7 @@ def make(folder: Path, pictures: Path, licence: Path, args: argparse.Namespace) 
         raise FileNotFoundError(f"{licence}: no such file; name the file that states the licence of the pictures")
     digests = [f"texture {files.sha256(path)}" for path in paths]
     numbers = range(args.first, args.first + args.clips)
-    wanted = {folder / f"warped_{n:05d}": _described(n, digests, args) for n in numbers}
+    wanted = {clip_path(folder, n): _described(n, digests, args) for n in numbers}
     missing = {path: meta for path, meta in wanted.items() if not path.exists()}
     for path, meta in wanted.items():
         if path not in missing:
@@ -238,6 +238,11 @@ def make(folder: Path, pictures: Path, licence: Path, args: argparse.Namespace) 
         rng = np.random.default_rng([args.seed, meta["source"]["number"]])
         write_clip(path, layers(lights, size, args.motion, rng), size, meta)
     return len(missing)
+
+
+def clip_path(folder: Path, n: int) -> Path:
+    """Return the folder of clip n."""
+    return folder / f"warped_{n:05d}"
 
 
 def _described(n: int, digests: list[str], args: argparse.Namespace) -> dict[str, Any]:
@@ -296,7 +301,10 @@ def main(words: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"warped_pictures: {files.wording(error)}", file=sys.stderr)
         return 2
-    print(f"{args.output}: {made} clips made, {args.clips - made} were there")
+    numbers = range(args.first, args.first + args.clips)
+    others = sum(Clip.open(clip_path(args.output, n)).meta.get("split") != args.split for n in numbers)
+    kept = f"; {others} of these keep another split than {args.split}" if others else ""
+    print(f"{args.output}: {made} clips made, {args.clips - made} were there{kept}")
     return 0
 
 

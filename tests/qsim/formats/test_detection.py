@@ -172,3 +172,23 @@ def test_a_gzipped_array_is_asked_about_like_another(tmp_path: Path):
         with pytest.raises(ValueError, match=r"a\.npy\.gz: uint8 up to 7: codes of 3 bits.* --layout codes"):
             importing.read(packed)
         np.testing.assert_array_equal(everything(packed, bits=3), codes)
+
+
+@pytest.mark.parametrize("other", ["000000.tif", "acq00000.bin"])
+def test_a_preview_beside_a_recording_is_not_taken_for_it(tmp_path: Path, other):
+    """One frame, the preview, became the clip."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    images.write_png(folder, iter(np.zeros((1, 8, 10), np.uint8)))
+    (folder / other).write_bytes(b"II*\0")
+    with pytest.raises(ValueError, match=r"holds recordings of two kinds \(.*; choose with --layout$"):
+        detection.detect(folder)
+
+
+@pytest.mark.parametrize("layout", [None, "png"])
+def test_a_picture_beside_folders_of_pictures_is_not_taken_for_them(tmp_path: Path, layout):
+    for place in (tmp_path, tmp_path / "a", tmp_path / "b"):
+        place.mkdir(exist_ok=True)
+        images.write_png(place, iter(np.zeros((2, 8, 10), np.uint8)))
+    with pytest.raises(ValueError, match=r"holds pictures and folders of pictures \(.*a\); move one of them away$"):
+        detection.recordings(tmp_path, layout)

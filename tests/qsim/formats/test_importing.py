@@ -277,3 +277,12 @@ def test_a_stream_states_the_defects_and_the_filters_of_its_sensor(tmp_path: Pat
     assert list(mine.meta["defects"]) == ["dark_map"]
     assert mine.sensor.dark_rate == 80.0
     np.testing.assert_array_equal(mine.codes(0, 4), plain.codes(0, 4))
+
+
+def test_a_light_level_that_sets_no_gain_is_refused(tmp_path: Path):
+    """It left no trace."""
+    np.save(tmp_path / "codes.npy", np.random.default_rng(0).integers(0, 8, (2, 5, 6)).astype(np.uint8))
+    recording = importing.read(tmp_path / "codes.npy", Hints(bits=3))
+    for name in ("spad-320x240", "quiver-paper"):
+        with pytest.raises(ValueError, match=f"--ppp changes nothing for {name}, whose gain is fixed; leave it out"):
+            importing.to_stream(recording, tmp_path / "s", Import(1000.0, sensor=name, ppp=5.0))
