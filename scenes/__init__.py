@@ -68,13 +68,14 @@ FAMILIES: dict[str, Family] = {
 RECIPES = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.toml"))}  # of data sets, by name
 
 
-def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
+def load(name: str | Path, seed: int = 0, speed: float = 1.0, *, along_path: bool = False) -> Scene:
     """Return the scene of a family, a .py file with `scene(seed, *, speed)`, a folder of assets, glTF or Mitsuba XML.
 
     `asset_folder.py` states what a folder may hold, `gltf_file.py` what becomes of an animated .glb or .gltf. An XML
     scene stands still and has no seed: a Python file that calls `qsim.read_mitsuba` moves its shapes.
     `FileNotFoundError` for a missing file; `ValueError` for a name that is none of these, for a speed outside 0.001
-    to 1000, and for one other than 1 that changes no motion of a .py or .xml scene.
+    to 1000, and for one other than 1 that changes no motion of a .py or .xml scene, unless its camera will move
+    `along_path`, on which the speed acts.
     """
     try:
         checks.speed(float(speed))
@@ -89,11 +90,11 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
             found = _from_file(Path(name))(seed, speed=speed)
         if not isinstance(found, Scene):
             raise ValueError(f"{name}: scene() returned a {type(found).__name__}; it must return a qsim.scene.Scene")
-        if speed != 1 and _moves_alike(found, _from_file(Path(name))(seed, speed=1.0)):
+        if speed != 1 and not along_path and _moves_alike(found, _from_file(Path(name))(seed, speed=1.0)):
             raise ValueError(f"{name}: moves at speed {speed:g} as at 1; let scene() use its speed, or leave it out")
         return found
     if str(name).endswith(".xml"):
-        if speed != 1:
+        if speed != 1 and not along_path:
             raise ValueError(f"{name}: an XML scene has no motion, so speed {speed:g} changes nothing; leave it out")
         from qsim.rendering.mitsuba_xml import read_mitsuba
 
@@ -114,7 +115,7 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
 
 def _moves_alike(one: Scene, other: Scene) -> bool:
     """Return whether camera, bodies, lamps and parts of two scenes have equal poses at some times."""
-    moments = (0.0, 5e-4, 3.3e-3, 0.0107)  # s
+    moments = (0.0, *np.geomspace(5e-4, 10.0, 50).tolist())  # s
     return all(all(map(np.array_equal, _places(one, t), _places(other, t))) for t in moments)
 
 

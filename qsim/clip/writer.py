@@ -140,8 +140,9 @@ class ClipWriter:
         if saturated is not None or mask in contents:
             entry["saturated"] = entry["clipped"]
         if error is not None:
-            entry["error"] = float(error)
-            entry["errors_at"] = [[float(value) for value in pair] for pair in errors_at]
+            lost = float(np.sqrt(np.mean((stored - np.minimum(radiance, exr.HALF_MAX)) ** 2)))  # by rounding to halves
+            entry["error"] = math.hypot(error, lost)
+            entry["errors_at"] = [[float(white), math.hypot(at_white, lost)] for white, at_white in errors_at]
         if fireflies is not None:
             entry["fireflies"] = int(fireflies)
         if self._camera is not None:

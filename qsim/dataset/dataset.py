@@ -14,7 +14,7 @@ from typing import Any
 
 from qsim import files, structure
 from qsim.clip.clip import Clip
-from qsim.dataset.job import Job
+from qsim.dataset.job import FRAME_RATE, Job
 from qsim.dataset.job_runner import make_record, record_path
 from qsim.dataset.recipe import SPLITS
 from qsim.files import Progress
@@ -64,7 +64,7 @@ class Dataset:
         table = self.recipe.get("recipe")
         recipe = table if isinstance(table, dict) else {}
         size = " x ".join(str(recipe.get(key, "?")) for key in ("frames", "height", "width"))
-        rate = recipe.get("frame_rate", "?")
+        rate = recipe.get("frame_rate", FRAME_RATE)
         missing = f", {len(self.missing)} not made yet" if self.missing else ""
         return f"<Dataset {self.name}: clips {splits}{missing}; {size} frames, rows, columns at {rate} fps>"
 

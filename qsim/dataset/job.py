@@ -13,6 +13,8 @@ from qsim.clip.sensing import Sensing
 from qsim.files import to_json
 from qsim.sensor.defects import defect_table
 
+FRAME_RATE = 2000.0  # Hz, unless a recipe states another
+
 
 @dataclass(frozen=True)
 class Settings:

@@ -77,9 +77,10 @@ def load_traced(job: Job) -> tuple[Scene, dict[str, str]]:
     from qsim.dataset.scene_rendering import along_path, in_bands
 
     settings = job.settings
-    scene, read = scene_files.load(job.family, seed=job.scene_seed, speed=job.speed)
-    scene = along_path(scene, settings.camera_path, settings.frame_rate, job.speed)
-    return in_bands(scene.resized(settings.height, settings.width), settings.bands), read
+    moved, size = settings.camera_path is not None, (settings.height, settings.width)
+    scene, read = scene_files.load(job.family, job.scene_seed, job.speed, along_path=moved)
+    scene = along_path(scene, settings.camera_path, settings.frame_rate, size, job.speed)
+    return in_bands(scene.resized(*size), settings.bands), read
 
 
 def render_seed(job: Job) -> int:

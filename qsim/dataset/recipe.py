@@ -52,7 +52,7 @@ from typing import Any
 from qsim import checks, files
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.sensing import Sensing, filters_of, prepare
-from qsim.dataset.job import Job, Settings
+from qsim.dataset.job import FRAME_RATE, Job, Settings
 from qsim.dataset.recipe_sections.scenes_section import SETTINGS, jobs_of, settings_of
 from qsim.dataset.recipe_sections.streams_section import streams_of
 from qsim.dataset.recipe_sections.toml_section import Section, Text, file_name
@@ -120,7 +120,7 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
     head = Section(written, "recipe", 0, document.table["recipe"])
     given = head.values(HEAD)
     name, seed = given["name"], given.get("seed", 0)
-    defaults = {"frame_rate": 2000.0} | settings_of(head, given)
+    defaults = {"frame_rate": FRAME_RATE} | settings_of(head, given)
     streams: list[Sensing] = []
     taken: set[str] = set()
     for section in document.sections("streams"):

@@ -41,13 +41,15 @@ _LIBRARY = Path(scenes.__file__).resolve().parent
 _PARTS_LEFT_OUT = frozenset({".cache", "site-packages", "dist-packages"})
 
 
-def load(family: str | Path, seed: int = 0, speed: float = 1.0) -> tuple[Scene, dict[str, str]]:
+def load(
+    family: str | Path, seed: int = 0, speed: float = 1.0, *, along_path: bool = False
+) -> tuple[Scene, dict[str, str]]:
     """Load a scene as `scenes.load` does, with the SHA-256 of each file read; empty for a family of the library."""
     path = Path(family).resolve()
     if str(family) in scenes.FAMILIES or not path.exists():
-        return scenes.load(family, seed, speed), {}
+        return scenes.load(family, seed, speed, along_path=along_path), {}
     with _tracing() as trace:
-        scene = scenes.load(family, seed, speed)
+        scene = scenes.load(family, seed, speed, along_path=along_path)
     if path.suffix == ".xml":
         found = of_xml(path)
     elif path.is_dir():

@@ -109,20 +109,31 @@ def load_scene(
     if isinstance(scene, Scene):
         if speed is not None:
             raise ValueError(f"scene {scene.name}: a Scene has its motions already; leave speed= out")
-        scene = along_path(scene, camera_path, frame_rate)
-        return in_bands(scene.resized(height or scene.camera.height, width or scene.camera.width), bands), {}
-    loaded, read = scene_files.load(os.fspath(scene), seed, 1.0 if speed is None else speed)
-    loaded = along_path(loaded, camera_path, frame_rate, 1.0 if speed is None else speed)
-    return in_bands(loaded.resized(SIDE if height is None else height, SIDE if width is None else width), bands), read
+        size = height or scene.camera.height, width or scene.camera.width
+        return in_bands(along_path(scene, camera_path, frame_rate, size).resized(*size), bands), {}
+    factor, size = (
+        1.0 if speed is None else speed,
+        (SIDE if height is None else height, SIDE if width is None else width),
+    )
+    loaded, read = scene_files.load(os.fspath(scene), seed, factor, along_path=camera_path is not None)
+    return in_bands(along_path(loaded, camera_path, frame_rate, size, factor).resized(*size), bands), read
 
 
 def along_path(
-    scene: Scene, camera_path: str | os.PathLike[str] | None, frame_rate: float, speed: float = 1.0
+    scene: Scene,
+    camera_path: str | os.PathLike[str] | None,
+    frame_rate: float,
+    size: tuple[int, int],
+    speed: float = 1.0,
 ) -> Scene:
-    """Return a scene seen by the camera of a transforms.json, or as it is without one; errors as of its reader."""
+    """Return a scene seen by the camera of a transforms.json, or as it is without one; errors as of its reader.
+
+    `size` (height, width) [px] is that of pictures whose size the file does not state.
+    """
     if camera_path is None:
         return scene
-    return replace(scene, camera=read_camera_path(camera_path, scene.camera, frame_rate=frame_rate, speed=speed))
+    camera = read_camera_path(camera_path, scene.camera, frame_rate=frame_rate, speed=speed, size=size)
+    return replace(scene, camera=camera)
 
 
 def in_bands(scene: Scene, bands: str | None) -> Scene:

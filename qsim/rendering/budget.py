@@ -30,7 +30,7 @@ class Budget:
 
     samples: int = 32  # per pixel and frame, all instants and both halves together
     bounces: int = 6  # scatterings along a path
-    sub_frames: int = 9  # instants per exposure when the shutter is open; their error is measured if 3, 6, 9 ...
+    sub_frames: int = 9  # instants per exposure when the shutter is open; their error is measured if 6, 9, 12 ...
     sharp: bool = True  # also render the instant at mid-exposure when the shutter is open
     denoise: bool = False  # Open Image Denoise; its error is measured against raw halves
     left_out: float = 0.0  # W m^-2 sr^-1, rms of later bounces by the pilot; part of the error that a frame states
@@ -140,7 +140,9 @@ def blur_left(means: Array, count: int) -> float:
     `means` [3, 2, H, W] are the means of all instants, of every third one, and the middle one alone, each in two
     independent halves. The product of the halves' differences is a squared error without bias from noise. The error
     falls as a power of the count, from 1/2 (separate thin ghosts) to 2 (steps below a pixel). The middle instant and
-    the thirds determine that power; for three instants it is 2. Other counts have no thirds: 0, not measured.
+    the thirds determine that power. For three instants they are the same, and it is taken as 2, which holds for steps
+    below a pixel: with larger ones the error of three is up to 6 times as large. Other counts have no thirds: 0, not
+    measured.
     """
     if count % 3:
         return 0.0

@@ -89,6 +89,8 @@ def choose_budget(
     """
     if not 10 <= psnr <= 80:
         raise ValueError(f"psnr: expected 10 to 80 dB, got {psnr!r}")
+    if frames < 1:
+        raise ValueError(f"frames: expected a whole number from 1 up, got {frames!r}")
     for name, wish in (("denoise", denoise), ("reuse", reuse)):
         if not isinstance(wish, bool | None):
             raise ValueError(f"{name}: expected True, False or None, got {wish!r}")

@@ -91,10 +91,9 @@ class Stage:
 
     def shape_numbers(self) -> dict[str, int]:
         """Return shape id -> body number; lamps follow the bodies; the sun's disk is -1 (surroundings)."""
-        numbers = {f"body{i}": i for i in range(len(self.scene.bodies))}
+        numbers = {"sun": -1} | {f"body{i}": i for i in range(len(self.scene.bodies))}
         numbers |= {f"light{i}": len(self.scene.bodies) + i for i in range(len(self.scene.lights))}
-        numbers |= {part.name: i for i, part in enumerate(self.scene.parts)}
-        return numbers | {"sun": -1}
+        return numbers | {part.name: i for i, part in enumerate(self.scene.parts)}
 
     def _place_body(self, name: str, body: Body, t: float) -> None:
         pose = body.pose(t)

@@ -10,6 +10,7 @@ and the camera.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,8 @@ def read_mitsuba(
     pixels of 1.1 um. The file's integrator and samples do not count. `FileNotFoundError` for a missing file;
     `ValueError` for a file that Mitsuba refuses, without light, with participating media, with a camera that is not a
     plain `perspective`, for motions of unknown shapes or of shapes that cannot be moved rigidly, and for flickers of
-    lights that are unknown or whose strength is not one number.
+    lights that are unknown or whose strength is not one number. Shapes with holes by opacity warn: their truth is that
+    of the whole shape.
     """
     select()
     import mitsuba as mi
@@ -57,6 +59,12 @@ def read_mitsuba(
     for shape in loaded.shapes():
         if shape.interior_medium() is not None or shape.exterior_medium() is not None:
             raise ValueError(f"{path}: shape {shape.id()!r} holds a participating medium, which is not rendered here")
+        bsdf = shape.bsdf()
+        if bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and "ThinDielectric" not in str(bsdf):
+            warnings.warn(
+                f"{path}: shape {shape.id()!r} has holes by its opacity; truth (flow, depth, bodies) ignores them",
+                stacklevel=2,
+            )
     names = [shape.id() for shape in loaded.shapes()]
     parameters = mi.traverse(loaded)
     for name in motions:

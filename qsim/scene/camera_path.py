@@ -70,10 +70,12 @@ def read_camera_path(
     frame_rate: float | None = None,
     speed: float = 1.0,
     scale: float = 1.0,
+    size: tuple[int, int] | None = None,
 ) -> Camera:
     """Return the camera of a transforms.json: its view, distortion, principal point, and all poses as its motion.
 
-    The rest is as in `like` (without it f/2.8 and pixels of 1.1 um), also the size [px] if the file states none. Poses
+    The rest is as in `like` (without it f/2.8 and pixels of 1.1 um), also the size [px] if the file states none; with
+    `size` (height, width) [px] the pictures of a file without a size have this one, and its view is an angle. Poses
     are in the order of their `file_path`, the first at time 0, as many per second as the file states, else
     `frame_rate`; `speed` is a factor on that. `scale` is the length of the file's unit [m]. `motion` starts at the
     first pose, in the camera's own axes: another camera that takes it moves alike.
@@ -93,7 +95,15 @@ def read_camera_path(
     if rate is None:
         raise ValueError(f"{where}: states no frame_rate; give the poses per second, as in frame_rate=30")
     poses = [_pose(frame, scale) for frame in frames]
-    placed = _seen_from(content | _common(frames, where), where, like or PLAIN, poses[0], like is not None)
+    found = content | _common(frames, where)
+    if size is not None and not all(found.get(key) for key in ("w", "h")):
+        pixels = [key for key in ("fl_x", "fl_y", "cx", "cy") if found.get(key) is not None]
+        if pixels:
+            raise ValueError(
+                f"{where}: {pixels[0]} is in pixels, and w and h are missing; add the size of its pictures"
+            )
+        like = (like or PLAIN).resized(*size)
+    placed = _seen_from(found, where, like or PLAIN, poses[0], like is not None)
     inside = [np.linalg.inv(placed.pose()) @ pose for pose in poses]
     motion = Keyframes(
         tuple(i / (rate * speed) for i in range(len(poses))),

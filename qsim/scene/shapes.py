@@ -210,7 +210,11 @@ def wire(path: ArrayLike, radius: float, sides: int = 8, closed: bool = False) -
 
 
 def mesh_file(path: str | Path, size: float | None = None) -> Mesh:
-    """Return all meshes of a file as one, centred on its bounding box; `size` [m] scales its longest side."""
+    """Return all meshes of a file as one, centred on its bounding box; `size` [m] scales its longest side.
+
+    Texture coordinates and normals of the file are left out: faces are flat, and a picture is projected along the
+    nearest axis.
+    """
     import trimesh
 
     if not Path(path).is_file():

@@ -247,3 +247,21 @@ def test_a_family_renders_light_everywhere_and_true_motion(family):
     assert frame.radiance.min() > 0
     assert frame.radiance.max() > 1.5 * frame.radiance.min()
     assert np.nanmax(np.hypot(*frame.flow)) * HEIGHT / 32 > 0.7
+
+
+def test_a_speed_acts_late_or_along_a_path(tmp_path):
+    """A scene whose motion begins after 25 ms was refused, and so was the speed of a camera around a scene at rest."""
+    own = tmp_path / "late.py"
+    own.write_text(
+        "from dataclasses import replace\nfrom qsim import scenes\nfrom qsim.scene import Keyframes\n\n\n"
+        "def scene(seed=0, *, speed=1.0):\n"
+        "    plain = scenes.load('plain')\n"
+        "    moved = Keyframes((0.05 / speed, 0.1 / speed), ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)))\n"
+        "    rest = [replace(body, motion=None) for body in plain.bodies[1:]]\n"
+        "    return replace(plain, bodies=(replace(plain.bodies[0], motion=moved), *rest))\n"
+    )
+    scenes.load(own, speed=2.0)
+    own.write_text(own.read_text().replace(" / speed", ""))
+    with pytest.raises(ValueError, match="moves at speed 2 as at 1"):
+        scenes.load(own, speed=2.0)
+    scenes.load(own, speed=2.0, along_path=True)

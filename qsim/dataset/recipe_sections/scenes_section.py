@@ -35,11 +35,11 @@ def jobs_of(section: Section, defaults: dict[str, Any], seed: int, streams: tupl
     family = _family(section, given["family"])
     seeds = _seeds(section, given)
     speeds = given.get("speed", [1.0])
-    if family.endswith(".xml") and speeds != [1.0]:
-        why = "an .xml scene has no motion, so speed changes nothing; leave it out"
-        raise ValueError(f"{section.where('speed')}: {why}")
     split = given.get("split", "train")
     settings = Settings(**(defaults | settings_of(section, given)))
+    if family.endswith(".xml") and speeds != [1.0] and settings.camera_path is None:
+        why = "an .xml scene has no motion, so speed changes nothing; leave it out"
+        raise ValueError(f"{section.where('speed')}: {why}")
     if settings.height * settings.width > MAX_PIXELS:
         size = f"frames of {settings.height} x {settings.width} pixels"
         raise ValueError(f"{section.where()}: {size}; at most {MAX_PIXELS} pixels are rendered")
@@ -71,7 +71,7 @@ def settings_of(section: Section, given: dict[str, Any]) -> dict[str, Any]:
     if "camera_path" in found:
         file = (section.text.path.parent / found["camera_path"]).resolve()
         with section.naming("camera_path", "camera_path: "):
-            read_camera_path(file, PLAIN, frame_rate=1.0)
+            read_camera_path(file, frame_rate=1.0, size=(PLAIN.height, PLAIN.width))
         found["camera_path"] = str(file)
     return found
 

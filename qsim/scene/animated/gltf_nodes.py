@@ -37,11 +37,12 @@ Tracks = dict[tuple[int, str], Track]  # of (node, path)
 
 
 def animation_names(document: Document) -> list[str]:
-    """Return the names of a file's animations; one without a name has its number."""
-    found = []
+    """Return the names of a file's animations; one without a name has its number, and so have repeated names."""
+    found: list[str] = []
     for i, entry in enumerate(entries_of(document.path, document.content, "animations")):
         about = structure(entry, {"name, if any": TEXT}, f"{document.path}: animations[{i}]", closed=False)
-        found.append(about.get("name", str(i)))
+        name = about.get("name", str(i))
+        found.append(f"{name} #{i}" if name in found else name)
     return found
 
 

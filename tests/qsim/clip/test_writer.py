@@ -218,3 +218,15 @@ def test_light_too_small_for_half_floats_is_refused_and_can_be_scaled(tmp_path: 
         assert list(tmp_path.iterdir()) == []  # the same settings with other light start again
     assert write_light("a", 1.6e-5, 1e-9).radiance(1).max() == pytest.approx(1.6e-5, rel=2e-3)
     assert write_light("dark", 0.0, 0.0).mean_radiance == 0.0
+
+
+def test_the_stated_error_holds_the_rounding_to_halves(tmp_path: Path):
+    """A frame of one value, known without error, was stated with an error of 0; stored it is 0.70019531."""
+    flat = np.full((HEIGHT, WIDTH), 0.7)
+    with ClipWriter(tmp_path / "a", meta(shape=[1, HEIGHT, WIDTH])) as writer:
+        writer.add(0, flat, error=0.0, errors_at=[(0.5, 0.0), (2.0, 3e-4)])
+        entry = dict(writer._frames[0])
+    lost = abs(float(np.float16(0.7)) - 0.7)
+    assert lost > 1e-4
+    assert entry["error"] == pytest.approx(lost)
+    assert entry["errors_at"] == [pytest.approx([0.5, lost]), pytest.approx([2.0, np.hypot(3e-4, lost)])]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_scenes import CAMERA, plate, renderer, scene, square
 
-from qsim import colour
+from qsim import colour, scenes
 from qsim.clip.clamped_error import Errors, Stated, error_at, white_in
 from qsim.rendering import fidelity
 from qsim.rendering.budget import Allowed, Budget, Finding, blur_error, explain
@@ -237,3 +237,8 @@ def test_effects_left_out_are_listed_with_their_size():
     for word in ("depth of field", "diffraction", "Airy disk", "bounces", "samples", "motion blur"):
         assert word in text
     assert explain(Budget().findings) == ""
+
+
+def test_a_clip_without_frames_is_refused():
+    with pytest.raises(ValueError, match="frames: expected a whole number from 1 up, got 0"):
+        choose_budget(scenes.load("plain").resized(16, 16), frames=0)

@@ -177,3 +177,21 @@ def test_flickers_of_no_light_are_refused(tmp_path, flickers, message):
     path = written(tmp_path, SENSOR, LIGHTS["bulb"], LIGHTS["lamp"], SHAPES)
     with pytest.raises(ValueError, match=message):
         read_mitsuba(path, flickers=flickers)
+
+
+def test_a_shape_called_sun_has_its_own_truth(tmp_path):
+    """Its flow, depth and body were those of the sky."""
+    ball = '<shape type="sphere" id="sun"><float name="radius" value="0.9"/></shape>'
+    views = Renderer(read_mitsuba(written(tmp_path, SENSOR, LIGHT, ball)), frame_rate=RATE, budget=BUDGET)
+    frame = views.frame(0)
+    assert sorted(np.unique(frame.body_id)) == [-1, 0]
+    assert np.isfinite(frame.depth[frame.body_id == 0]).all()
+
+
+def test_holes_by_opacity_are_told(tmp_path):
+    """Light passes them, and the truth there is that of the whole shape."""
+    card = '<shape type="rectangle" id="leaf"><bsdf type="mask"><float name="opacity" value="0.5"/>{}</bsdf></shape>'
+    pane = '<shape type="rectangle" id="pane"><bsdf type="thindielectric"/></shape>'
+    with pytest.warns(UserWarning, match="shape 'leaf' has holes by its opacity") as caught:
+        read_mitsuba(written(tmp_path, SENSOR, LIGHT, card.format('<bsdf type="diffuse"/>'), pane))
+    assert len(caught) == 1

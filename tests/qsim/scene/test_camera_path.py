@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from hostile import VALUES, one_line
 
+from qsim import scenes
+from qsim.dataset.scene_rendering import along_path
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
 from qsim.scene import Spin, Still, Translation
@@ -210,3 +212,18 @@ def test_paths_are_written_whole_or_not_at_all(tmp_path: Path):
     for wrong in ({"scale": 0.0}, {"speed": math.nan}):
         with pytest.raises(ValueError, match="must be a number above 0"):
             read_camera_path(file, **wrong)
+
+
+@pytest.mark.parametrize("size", [(128, 128), (48, 200)])
+def test_an_angle_without_a_size_is_that_of_the_rendered_picture(tmp_path: Path, size):
+    """It was that of the family's 512 x 1024 px, whose height was then kept: 39.6 degrees became 20.4."""
+    file = written(tmp_path / "b.json", fl_x=None, fl_y=None, w=None, h=None, camera_angle_x=0.6911)
+    scene = scenes.load("room")
+    found = along_path(scene, file, 2000.0, size).resized(*size).camera
+    assert (found.height, found.width) == size
+    assert 2 * math.atan(size[1] / 2 / found.focal_pixels) == pytest.approx(0.6911)
+    stated = written(tmp_path / "c.json", fl_x=None, fl_y=None, w=2 * size[1], h=2 * size[0], camera_angle_x=0.6911)
+    same = along_path(scene, stated, 2000.0, size).resized(*size).camera
+    assert same.focal_pixels == pytest.approx(found.focal_pixels)
+    with pytest.raises(ValueError, match="fl_x is in pixels, and w and h are missing"):
+        along_path(scene, written(tmp_path / "d.json", w=None, h=None), 2000.0, size)

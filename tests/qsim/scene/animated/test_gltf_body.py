@@ -306,6 +306,15 @@ def test_files_of_another_program_are_read_as_it_reads_them(tmp_path):
     assert np.array_equal(motion.deform(7.7), mesh.vertices)
 
 
+def test_animations_of_one_name_are_told_apart(tmp_path):
+    """Names need not differ; only the first could be chosen."""
+    file = arm()
+    file.content["animations"] = [file.content["animations"][0] | {"name": "Take"} for _ in range(3)]
+    path = file.write(tmp_path / "arm.glb")
+    assert animations_in(path) == ["Take", "Take #1", "Take #2"]
+    animated_file(path, animation="Take #2")
+
+
 def nothing(file: Gltf) -> None:
     file.content["animations"] = []
 
