@@ -160,6 +160,7 @@ def _run_recipes(args: argparse.Namespace) -> int:
 
     if args.print is not None:
         path, text = recipe.text_of(args.print)
+        text = text.replace('"sensors/', f'"{path.resolve().parent}/sensors/')  # a copy elsewhere finds them too
         output(args, {"recipe": str(path), "text": text}, text.rstrip("\n"))
         return 0
     found = {name: recipe.load(name) for name in RECIPES}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.cli.console import WITHOUT_FORCE, bar, command, note, output, refuse_idle
+from qsim.cli.console import MAKES_AGAIN, bar, command, note, output, refuse_idle
 from qsim.cli.options import checked, numbers
 
 
@@ -78,7 +78,7 @@ def _run_sense(args: argparse.Namespace) -> int:
     from qsim.clip.sensing import Sensing, sense
 
     if args.force:
-        args.after_interrupt = WITHOUT_FORCE
+        args.after_interrupt = MAKES_AGAIN
     if args.ppp and args.lux:
         raise ValueError("give the light level as --ppp or as --lux, not both")
     levels = [{"ppp": ppp} for ppp in args.ppp or []] + [{"lux": lux} for lux in args.lux or []] or [{}]

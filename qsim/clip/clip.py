@@ -62,10 +62,10 @@ class Clip(ClipFolder):
         name: str | None = None,
         group: bool = False,
         diffraction: bool = False,
-        defects: str | Defects | None = None,
+        defects: str | os.PathLike[str] | Defects | None = None,
         slices: int = 1,
         rows: Rows | None = None,
-        colour: str | ColourFilter | None = None,
+        colour: str | os.PathLike[str] | ColourFilter | None = None,
         exposures: tuple[float, ...] | None = None,
         follow: bool = False,
         force: bool = False,
@@ -80,6 +80,8 @@ class Clip(ClipFolder):
         `FileExistsError` where `name` is taken by others.
         """
         chosen = sensor if isinstance(sensor, Sensor) else os.fspath(sensor)
+        defects = os.fspath(defects) if isinstance(defects, os.PathLike) else defects
+        colour = os.fspath(colour) if isinstance(colour, os.PathLike) else colour
         light = (chosen, bits, ppp, lux, seed, name)
         wanted = Sensing(*light, group, diffraction, defects, slices, rows, colour, exposures, follow)
         return self.stream(sense(self, wanted, force=force, progress=progress)[0].name)

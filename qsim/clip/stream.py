@@ -47,9 +47,9 @@ class Stream:
     keeps: object = field(default=None, repr=False)  # a temporary folder: it lasts as long as a reference to it
 
     @staticmethod
-    def open(json_path: Path) -> Stream:
+    def open(json_path: str | Path) -> Stream:
         """Open a stream; `FileNotFoundError` if it does not exist, `ValueError` if its description is damaged."""
-        if not json_path.is_file():
+        if not (json_path := Path(json_path)).is_file():
             raise FileNotFoundError(f"{json_path}: no such stream")
         meta = files.read_json(json_path)
         files.check_version(json_path, meta.get("format_version"), FORMAT_VERSION)
@@ -138,7 +138,7 @@ class Stream:
 
     def known(self) -> Array | None:
         """Return bool [T, H, W], False where light of `truth` is cut off (`Clip.saturated`); None if all is known."""
-        if not self.clip.meta.get("saturated_pixels"):
+        if self.clip.bands is not None or not self.clip.meta.get("saturated_pixels"):  # of colour they are counted only
             return None
         return ~np.stack([self._at_mid_exposure(self.clip.saturated, t) for t in range(len(self))])
 

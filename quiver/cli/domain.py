@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.cli.console import WITHOUT_FORCE, bar, output
+from qsim.cli.console import MAKES_AGAIN, bar, output
 from qsim.cli.options import checked, numbers, whole_numbers, words
 from quiver.cli.options import add_running, command, running_options, use_threads
 
@@ -51,14 +51,16 @@ def _run_domain(args: argparse.Namespace) -> int:
     from quiver.restoration.sources import refuse, refuse_idle
 
     if args.force:
-        args.after_interrupt = WITHOUT_FORCE
+        args.after_interrupt = MAKES_AGAIN
 
     path = weights_path(args.weights)
     if args.clips:
-        from quiver.evaluation.domain_measurement import measure
+        from quiver.evaluation.domain_measurement import forget_damaged, measure
 
         threads.check(args.threads)
         options, settings = running_options(args), _settings(args)
+        if args.force:
+            forget_damaged(path)
         refuse_idle(vars(args), [network_restorer(path, options)])
         use_threads(args)
         with bar("cells", "cell") as progress:

@@ -333,3 +333,17 @@ def test_ctrl_c_of_a_command_that_starts_again(tmp_path):
     assert err.splitlines()[-1] == "qsim: interrupted; no incomplete file is left; run the same command again"
     assert "Traceback" not in err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["long"]
+
+
+def test_streams_that_force_replaces_are_not_resumed_without_it(tmp_path, monkeypatch, capsys):
+    """Without --force, those that were not replaced yet would stay as they are."""
+    clip = wave_clip(tmp_path / "c", 4, 1)
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("qsim.clip.sensing.sense", interrupt)
+    resumes = "the same command resumes with the missing streams"
+    for words, then in (([], resumes), (["--force"], console.MAKES_AGAIN)):
+        assert main(["sense", str(clip.path), "--ppp", "1", *words]) == 130
+        assert capsys.readouterr().err.endswith(f"qsim: interrupted; {then}\n")

@@ -10,7 +10,7 @@ from clips import write_clip
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
 from qsim.clip.sensing import Sensing, sense
-from qsim.clip.stream import write_packed
+from qsim.clip.stream import Stream, write_packed
 from qsim.sensor import packing
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.defect_table import Defects
@@ -144,3 +144,16 @@ def test_clips_and_streams_show_themselves(tmp_path: Path):
         assert thing.show().pictures.shape == (3, 5, 6)
         assert "data:image/gif" in thing.show()._repr_html_()
         assert thing.show(1, 2).pictures.shape == (1, 5, 6)
+
+
+def test_files_are_named_by_text_or_path(tmp_path: Path):
+    """A stream took a path alone, and tables of a sensor text alone: the others ended in an `AttributeError`."""
+    clip = write_clip(tmp_path / "c")
+    (tmp_path / "d.toml").write_text("[defects]\ndead = 0.1\n")
+    one, two = (
+        clip.sense("spad-320x240", ppp=1.0, name=name, defects=kind(tmp_path / "d.toml"))
+        for name, kind in (("a", str), ("b", Path))
+    )
+    assert np.array_equal(one.codes(), two.codes())
+    description = one.path.with_suffix(".json")
+    assert Stream.open(str(description)).meta == Stream.open(description).meta

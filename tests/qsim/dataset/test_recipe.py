@@ -12,6 +12,7 @@ import pytest
 from fakes import make
 
 from qsim import checks
+from qsim.cli.program import main
 from qsim.dataset import job_runner, provenance, recipe
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe import Recipe, parse
@@ -472,3 +473,11 @@ def test_a_shipped_recipe_is_found_by_its_name_unless_a_file_has_it(name: str, t
 def test_a_misspelt_recipe_is_suggested():
     with pytest.raises(FileNotFoundError, match=r"startr: no such recipe \(did you mean 'starter'\?\)"):
         recipe.load("startr")
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_the_printed_text_of_a_shipped_recipe_is_a_recipe_elsewhere(name: str, tmp_path: Path, capsys):
+    """Sensor files beside the shipped recipe were looked up beside the copy."""
+    assert main(["recipes", "--print", name]) == 0
+    (tmp_path / "mine.toml").write_text(capsys.readouterr().out)
+    assert len(recipe.load(tmp_path / "mine.toml").jobs) == len(recipe.load(name).jobs)

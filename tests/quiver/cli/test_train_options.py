@@ -226,8 +226,14 @@ def test_an_interrupted_run_is_resumed_without_force(capsys, tiny_dataset, tmp_p
     assert capsys.readouterr().err == f"quiver: interrupted; {again} resumes where it stopped\n"
 
 
-@pytest.mark.parametrize("command", ["evaluate", "domain"])
-def test_interrupted_measurements_are_resumed_without_force(capsys, tiny_dataset, tmp_path, monkeypatch, command):
+@pytest.mark.parametrize(
+    ("command", "then"),
+    [
+        ("evaluate", "the same command without --force resumes"),
+        ("domain", "the same command with --force makes all of them again"),  # without it, known cells keep their value
+    ],
+)
+def test_interrupted_measurements_state_what_continues(capsys, tiny_dataset, tmp_path, monkeypatch, command, then):
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
@@ -235,7 +241,7 @@ def test_interrupted_measurements_are_resumed_without_force(capsys, tiny_dataset
     (tmp_path / "o").mkdir()
     words = [weights(tmp_path), tiny_dataset] if command == "domain" else [tiny_dataset, "-o", tmp_path / "o"]
     assert main([command, *map(str, words), "--force"]) == 130
-    assert "; the same command without --force resumes" in capsys.readouterr().err
+    assert then in capsys.readouterr().err
 
 
 STOPS = {
