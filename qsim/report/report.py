@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from qsim import colour, files
-from qsim.clip.clamped_error import stated
+from qsim.clip.clamped_error import stated, white_in
 from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import MOVING
 from qsim.clip.stream import Stream
@@ -179,7 +179,9 @@ def dataset_sections(path: Path, step: Callable[[], None] = lambda: None) -> lis
 
 
 def restored_section(path: Path) -> page.Section:
-    """Return restored video beside its codes and truth, all with one white, with the error of each.
+    """Return restored video beside its codes and truth, with the error of each.
+
+    All have one white, but codes whose brightest light is less are white there.
 
     Flow, depth, bodies and hidden points of the clip lie over its light.
     """
@@ -197,12 +199,14 @@ def restored_section(path: Path) -> page.Section:
     wheel, lines = None, [f"{meta.get('description', name)}; {page.seconds_text(meta['seconds_per_frame'])} per frame."]
     if clip is None or stream is None or truth is None:
         panels = [own]
+        if clip is None and Path(f"{meta.get('source') or 'none'}").with_suffix(".json").is_file():
+            lines.append("Its stream was replaced since: the video is shown without codes and light.")
     else:
         light = page.Panel(light_name(clip), fit(toned(truth, white)))
         panels = [light, own, error_panel(name, shown, truth), *stream_panels(stream, frames, truth)]
         lines.append(
-            f"PSNR of {len(frames)} frames against the {light_name(clip)}, both clamped at its white. Codes are shown "
-            "as the light at which they are the mean code."
+            f"PSNR of {len(frames)} frames against the {light_name(clip)}, both clamped at "
+            f"{white_in(truth):.3g} photons. Codes are shown as the light at which they are the mean code."
         )
         if clip.has_truth:
             overlays, largest, _ = truth_panels(clip, frames)
@@ -223,12 +227,15 @@ def restored_section(path: Path) -> page.Section:
 
 
 def _source(meta: dict[str, Any]) -> tuple[Clip | None, Stream | None]:
-    """Return the clip and stream of a restored video, or (None, None) if they are no longer there."""
-    stream = Path(str(meta.get("source", "")))
+    """Return the clip and stream of a restored video, or (None, None) if they are no longer there, or were replaced."""
+    path = Path(f"{meta.get('source') or 'none'}")
     try:
-        return Clip.open(stream.parents[1]), Stream.open(stream.with_suffix(".json"))
+        clip, stream = Clip.open(path.parents[1]), Stream.open(path.with_suffix(".json"))
     except (IndexError, ValueError, OSError):
         return None, None
+    now, shape = stream.meta.get("sha256"), meta.get("shape") or stream.shape
+    same = (meta.get("source_sha256") or now) == now and (shape[0], *shape[-2:]) == tuple(stream.shape)
+    return (clip, stream) if same else (None, None)
 
 
 _DRAW: dict[str, Callable[[Path], page.Section]] = {

@@ -97,9 +97,9 @@ def evaluation_section(path: Path) -> page.Section:
         [
             line["method"],
             line["light"],
-            _pm(line["scores"]["psnr"], 2) + _near(line, "psnr"),
-            _pm(line["scores"]["psnr_matched"], 2) + _near(line, "psnr_matched"),
-            _pm(line["scores"]["ssim_matched"], 3),
+            _score(line, "psnr", 2) + _near(line, "psnr"),
+            _score(line, "psnr_matched", 2) + _near(line, "psnr_matched"),
+            _score(line, "ssim_matched", 3),
             page.seconds_text(line["seconds_per_frame"]),
             _percent(line.get("above_peak")),
             line["truth_psnr"],
@@ -108,7 +108,8 @@ def evaluation_section(path: Path) -> page.Section:
     ]
     lights = [line["light"] for line in found["table"]]
     means = [line["scores"]["psnr_matched"]["mean"] for line in found["table"]]
-    scores = {i: float(mean) for i, mean in enumerate(means) if mean is not None}  # "inf" too
+    failed = [line.get("failures") or [] for line in found["table"]]  # a mean over the other clips is another score
+    scores = {i: float(mean) for i, mean in enumerate(means) if mean is not None and not failed[i]}  # "inf" too
     best = {max((i for i in scores if lights[i] == lights[one]), key=scores.__getitem__) for one in scores}
     headers = [
         "method",
@@ -128,6 +129,11 @@ def evaluation_section(path: Path) -> page.Section:
         caption += "; † within 3 dB of the noise floor in at least one clip, so the error of the truth is a large part"
     table = page.table(page.Table(caption, headers, rows, frozenset(best)))
     remarks = [page.text(remark) for remark in found.get("remarks", [])]
+    remarks += [
+        page.text(f"{line['method']} at {line['light']} failed and has no rank: {reason}")
+        for line, reasons in zip(found["table"], failed, strict=True)
+        for reason in reasons
+    ]
     winners = [found["table"][i] for i in sorted(best)]
     facts = [
         page.Fact(
@@ -172,11 +178,17 @@ def _percent(share: object) -> str | None:
     return f"{100 * share:.1f} %" if isinstance(share, int | float) else None
 
 
+def _score(line: dict[str, Any], name: str, digits: int) -> str:
+    """Return a score of a line as text; "failed" where no clip has it because the method failed."""
+    found = line["scores"][name]
+    return "failed" if found["mean"] is None and line.get("failures") else _pm(found, digits)
+
+
 def _pm(interval: dict[str, Any], digits: int) -> str:
     """Return "23.45 ± 0.67", without the half-width if there is one scene; "inf" for the text that stands for it."""
     mean, half = interval["mean"], interval["half_width"]
     if mean is None:
-        return "n/a" if interval.get("scenes") else "failed"
+        return "n/a"
     return f"{float(mean):.{digits}f}" + (f" ± {half:.{digits}f}" if isinstance(half, int | float) else "")
 
 

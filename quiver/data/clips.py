@@ -87,7 +87,7 @@ def truth(clip: Clip, factor: float, start: int, stop: int) -> Array:
 
 def known(clip: Clip, start: int, stop: int) -> Array | None:
     """Return bool [stop - start, H, W], false where a saturated camera cut off the light; None if all are valid."""
-    if not clip.meta.get("saturated_pixels"):
+    if clip.bands is not None or not clip.meta.get("saturated_pixels"):  # pixels of colour clips are counted only
         return None
     return ~np.stack([clip.saturated(t) for t in range(start, stop)])
 

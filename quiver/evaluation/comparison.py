@@ -201,6 +201,12 @@ def check(comparison: Comparison) -> list[Clip]:
     clips = clips_of(comparison)
     if not clips:
         raise ValueError(f"{comparison.source}: no finished clip in split {comparison.split!r}")
+    names = [clip.name for clip in clips]
+    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        raise ValueError(
+            f"{comparison.source}: two clips are called {twice[0]}, by which rows are kept; make one of them again "
+            "under another name"
+        )
     for clip in clips:
         if comparison.published:
             clip.require_one_band("the published protocol")

@@ -114,6 +114,14 @@ def measure(
     return stored(weights, shared)
 
 
+def forget_damaged(weights: Path) -> None:
+    """Remove the cells of a weights file whose domain is damaged, so that it can be measured again."""
+    try:
+        read_scope(weights, metadata_of(weights))
+    except ValueError:
+        annotate(weights, {KEY: None})
+
+
 def stored(weights: Path, shared: Mapping[str, object]) -> Domain:
     """Return the cells in a weights file that were measured with these settings, and the settings of all of them."""
     domain = read_scope(weights, metadata_of(weights)).domain
@@ -174,7 +182,7 @@ def _measures(cell: Cell, light: Illumination) -> bool:
 def measure_cell(network: Restorer, methods: Sequence[Restorer], settings: DomainSettings, light: Illumination) -> Cell:
     """Return the cell of the network and the best method at one light. `ValueError` where a clip has no score."""
     own, *others = (_mean_score(method, settings, light) for method in (network, *methods))
-    if not (math.isfinite(own) and any(map(math.isfinite, others))):
+    if not math.isfinite(own) or any(map(math.isinf, others)) or all(map(math.isnan, others)):
         raise ValueError(f"{light.label}: the network, or every classical method, fails or has no score on these clips")
     best = int(np.nanargmax(others))
     clip = settings.clips[0]

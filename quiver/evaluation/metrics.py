@@ -251,7 +251,7 @@ def score_and_factors(
         ssim=_mean(np.where(hidden, nan, ssim(one, two, keep))),
         ssim_matched=_mean(np.where(hidden, nan, ssim(scaled, two, keep))),
         scale=float(scales.mean()),
-        scale_spread=float(scales.std()),
+        scale_spread=float(scales.std()) if per_frame_scale else 0.0,  # rounding alone is no spread
         frames=int(np.count_nonzero(~hidden)),
         above_peak=above_peak(two, keep),
     )

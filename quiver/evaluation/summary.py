@@ -61,6 +61,9 @@ class SummaryLine:
     failures: tuple[str, ...]  # clip: reason
 
 
+ROUNDING = 1e-9  # earlier versions stored the rounding of one factor per clip as its spread over windows
+
+
 def mean(values: Sequence[float]) -> float:
     """Return the mean of values; NaN without any."""
     return sum(values) / len(values) if values else math.nan
@@ -92,7 +95,7 @@ def _line(method: str, light: str, rows: Sequence[ComparisonRow]) -> SummaryLine
         scores={name: over_scenes([getattr(s, name) for _, s in good], [r.scene for r, _ in good]) for name in SCORES},
         psnr_matched_per_frame=sum(psnr * n for psnr, n in by_frames) / frames if frames else math.nan,
         scale=mean(scales),
-        scale_spread=within if within > 0 else spread,
+        scale_spread=within if within > ROUNDING else spread,
         psnr_by_motion=breakdown.pooled([row.motion_pixels for row in moved], [row.motion_squares for row in moved]),
         seconds_per_frame=mean([row.seconds_per_frame for row in alike]),
         peak_bytes=max((row.peak_bytes for row in alike if row.peak_bytes is not None), default=None),
@@ -132,7 +135,7 @@ def markdown(
     text = [
         f"# Evaluation of {comparison.source}, split {comparison.split or 'all'}, {count} clip{'s' * (count != 1)}",
         "",
-        f"{_seen_by(comparison)}, noise seed {comparison.seed}; "
+        f"{_seen_by(comparison)}{'' if comparison.stream else f', noise seed {comparison.seed}'}; "
         + (
             "published protocol: every window exposed, scaled and scored on its own"
             if comparison.published

@@ -144,12 +144,13 @@ def digest(path: Path) -> str:
     return found.hexdigest()
 
 
-def annotate(path: Path, notes: Mapping[str, str]) -> None:
-    """Add notes to a weights file of ours; its tensors do not change."""
+def annotate(path: Path, notes: Mapping[str, str | None]) -> None:
+    """Add notes to a weights file of ours, or remove those that are None; its tensors do not change."""
     tensors, metadata = read_safetensors(path)
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path}: not weights of this program (no format {FORMAT!r}); see `quiver convert-weights`")
-    write_bytes(path, to_safetensors(tensors, metadata | dict(notes)))
+    kept = {name: text for name, text in (metadata | dict(notes)).items() if text is not None}
+    write_bytes(path, to_safetensors(tensors, kept))
 
 
 class _WithoutValues(TorchFunctionMode):

@@ -153,7 +153,8 @@ def read_scope(path: Path, metadata: Mapping[str, str]) -> Scope:
     try:
         domain = None if text is None else Domain.from_json(text)
     except ValueError as error:
-        raise ValueError(f"{path}: its domain is damaged ({error}); measure it again with `quiver domain`") from None
+        advice = "measure it again with `quiver domain --force`"
+        raise ValueError(f"{path}: its domain is damaged ({error}); {advice}") from None
     return Scope(domain, _trained(metadata.get("settings")), bool(metadata.get("converted_from")))
 
 

@@ -74,7 +74,7 @@ def restore_to_file(
         try:
             seconds = _fill_file(codes, method, part, journal, meta, progress, note, threads)
             meta |= {"seconds_per_frame": seconds / codes.shape[0], "threads": threads, "device": method.device}
-            meta |= {"look_ahead": method.look_ahead}
+            meta |= {"look_ahead": method.look_ahead, "source_sha256": codes.source_sha256}
             meta = sealed(meta | {"sha256": sha256(part)})
             write_json(journal, meta)  # takes its disk space before anything is replaced
         except BaseException as error:
@@ -237,7 +237,7 @@ def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, 
         return 0, 0.0, ""
     try:
         found = read_json(journal)
-        for key in ("threads", "device", "look_ahead"):  # numbers agree to rounding on any device
+        for key in ("threads", "device", "look_ahead", "source_sha256"):  # numbers agree to rounding on any device
             found.pop(key, None)
         done, seconds = int(found.pop("done", 0)), float(found.pop("seconds", 0.0))
         for key in ("sha256", "checksum"):

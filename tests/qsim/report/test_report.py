@@ -216,3 +216,24 @@ def test_a_phone_sees_picture_and_scrubber_together(written, tab, dark):
     bottom = tab.value("document.querySelector('input.frame').getBoundingClientRect().bottom")
     assert 0 < bottom <= 845, "the scrubber stays below the panels that it moves"
     assert tab.problems == []
+
+
+def test_video_of_a_replaced_stream_is_not_scored_against_it(tmp_path):
+    """The new stream of another light, of the same name, gave the restored video a PSNR."""
+    clip = write_clip(tmp_path / "c", frames=4, height=12, width=14)
+    stream = clip.sense(ppp=3.25, bits=3, name="s")
+    np.save(tmp_path / "v.npy", np.full((4, 12, 14), 3.25, np.float32))
+    about = {"format": "quiver-restored-1", "method": "moment", "seconds_per_frame": 0.1, "source": str(stream.path)}
+    known = {"shape": [4, 12, 14], "source_sha256": stream.meta["sha256"]}
+    for changes, scored in (
+        (known, True),
+        ({}, True),  # of an earlier version
+        (known | {"source_sha256": "0" * 64}, False),
+    ):
+        (tmp_path / "v.json").write_text(json.dumps(about | changes))
+        body = report.restored_section(tmp_path / "v.json").body
+        assert ("both clamped at" in body) == scored
+        assert ("Its stream was replaced since" in body) != scored
+    clip.sense(ppp=9.75, bits=3, name="s", force=True)
+    (tmp_path / "v.json").write_text(json.dumps(about | known))
+    assert "Its stream was replaced since" in report.restored_section(tmp_path / "v.json").body

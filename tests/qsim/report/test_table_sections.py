@@ -201,3 +201,14 @@ def test_a_study_shows_its_own_picture(tmp_path):
         body = study_section(tmp_path / "tradeoff.json").body
         assert body.count("data:image/png") == 1
         assert f"{tmp_path.name}/{own}" in body
+
+
+def test_a_method_that_failed_on_some_clips_has_no_rank(tmp_path):
+    """The mean over the clips that it could restore was the best, without a word."""
+    lines = [scored("a", "3 PPP", 20.0), scored("b", "3 PPP", 24.0) | {"failures": ["large: a tile needs 132 x 132"]}]
+    section = evaluated(tmp_path, *lines)
+    assert "20.0 ± 0.5 dB by a at 3 PPP" in section.story
+    assert "b at 3 PPP failed and has no rank: large: a tile needs 132 x 132" in section.body
+    lines = [scored("a", "3 PPP", None, scenes=0), scored("b", "3 PPP", None, scenes=0) | {"failures": ["c: why"]}]
+    body = evaluated(tmp_path, *lines).body
+    assert (body.count("n/a"), body.count("failed</td>")) == (3, 3)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clips import ClipMaker, colour_clip
+from clips import ClipMaker, colour_clip, sliding_pattern
 from methods import broken, method
 from numpy import ndarray as Array
 from sensor_files import QIS, sensor_file
@@ -19,8 +19,9 @@ from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.sensing import Sensing, sense
 from qsim.clip.writer import ClipWriter
+from qsim.optics.radiometry import RGB
 from quiver.cli.program import main
-from quiver.data.clips import open_clips, truth
+from quiver.data.clips import known, open_clips, truth
 from quiver.data.codes import Codes, sensed, stream_codes
 from quiver.data.illumination import Illumination
 from quiver.evaluation import breakdown, metrics, summary
@@ -242,12 +243,16 @@ def test_truth_psnr_is_the_radiance_error_in_units_of_white(make_clip: ClipMaker
     """Relative clip, mean 1 by construction of the factor: rms 0.01 of radiance is 0.01 * 3.25 / mean of 8.125."""
     clip = make_clip(relative=True, error=0.01)
     _, factor = sensed(clip, Illumination())
-    expected = -20 * math.log10(0.01 * (3.25 / clip.mean_radiance) / 8.125)
+    light = sliding_pattern(len(clip), *clip.shape[1:], 0)
+    rounded = [np.sqrt(np.mean((light[t] - clip.radiance(t)) ** 2)) for t in range(4)]  # to half floats, 2e-4
+    error = math.sqrt(0.01**2 + np.mean(np.square(rounded)))
+    expected = -20 * math.log10(error * (3.25 / clip.mean_radiance) / 8.125)
     assert truth_psnr(clip, factor, 8.125, range(4)) == pytest.approx(expected)
     assert truth_psnr(make_clip("unknown", error=None), 1.0, 8.125, range(4)) is None
     # Measured clamped at white, it counts up to 2.5 x the mean light; a higher peak takes the unclamped one.
     halved = replace(clip, meta=clip.meta | {"error_at_white_per_frame": [0.005] * len(clip)})
-    assert truth_psnr(halved, factor, 8.125, range(4)) == pytest.approx(expected + 20 * math.log10(2))
+    half = -20 * math.log10(0.005 * (3.25 / clip.mean_radiance) / 8.125)
+    assert truth_psnr(halved, factor, 8.125, range(4)) == pytest.approx(half)
     assert truth_psnr(halved, factor, 16.25, range(4)) == truth_psnr(clip, factor, 16.25, range(4))
 
 
@@ -485,3 +490,50 @@ def test_memory_is_that_of_the_device_of_the_method(make_clip: ClipMaker, monkey
     assert [row.peak_bytes for row in rows] == [1000, 2000]
     assert [row.device for row in rows] == ["cpu", "cuda"]
     assert [line["devices"] for line in summary.as_dict(comparison, methods, rows)["table"]] == [["cpu"], ["cuda"]]
+
+
+def test_the_spread_of_factors_is_over_clips(tiny_dataset):
+    """It was 0.000 where the mean of a clip's equal factors is rounded, in rows of earlier versions too."""
+    known = {clip.name: clip for clip in open_clips(tiny_dataset)}
+
+    def restore(codes: Codes) -> Array:
+        clip = known[codes.name.split(",")[0]]
+        at = sorted(known).index(clip.name)
+        return truth(clip, sensed(clip, Illumination())[1], 0, len(clip)) / (0.7 + 0.1 * at)
+
+    rows = evaluate(Comparison(str(tiny_dataset)), [method("off", restore)])
+    factors = [row.score.scale for row in rows]
+    (line,) = summary.summarise(rows)
+    assert line.scale_spread == pytest.approx(np.std(factors))
+    rounded = [replace(row, score=replace(row.score, scale_spread=1e-16)) for row in rows]
+    assert summary.summarise(rounded)[0].scale_spread == pytest.approx(np.std(factors))
+
+
+def test_two_clips_of_one_name_are_refused(make_clip: ClipMaker, tmp_path):
+    """A renamed folder keeps the name of its clip: the second one got the row of the first."""
+    for seed in (0, 1):
+        make_clip("same", seed=seed).path.rename(tmp_path / f"folder_{seed}")
+    with pytest.raises(ValueError, match="two clips are called same, by which rows are kept"):
+        evaluate(Comparison(str(tmp_path), split=None), [method("any", lambda codes: codes.read(0, codes.shape[0]))])
+
+
+def test_the_table_of_a_stored_stream_states_no_seed_of_its_own(make_clip: ClipMaker, tmp_path):
+    sense(make_clip("c"), Sensing("quiver-physical", 3, ppp=3.25, seed=5, name="s"))
+    comparison = Comparison(str(tmp_path), split=None, stream="s")
+    assert "noise seed" not in summary.markdown(comparison, [], [])
+    assert "noise seed 0" in summary.markdown(replace(comparison, stream=None), [], [])
+
+
+def test_a_colour_clip_with_saturated_pixels_is_scored(tmp_path):
+    """They are counted and not stored: the mask of one band failed against three."""
+    meta = {"frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE, "camera": None, "bands": list(RGB)}
+    mask = np.zeros((3, 16, 18), bool)
+    mask[:, 4, 5] = True
+    with ClipWriter(tmp_path / "c", meta | {"shape": [3, 16, 18]}) as writer:
+        for t in range(3):
+            writer.add(t, np.full((3, 16, 18), 0.5), saturated=mask)
+    clip = Clip.open(tmp_path / "c")
+    assert clip.meta["saturated_pixels"] > 0
+    stream = clip.sense("quiver-physical", ppp=3.25, bits=3, colour="rggb", name="s")
+    assert known(clip, 0, 3) is None
+    assert stream.known() is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -175,3 +176,25 @@ def test_the_command_shows_and_measures(capsys, tiny_dataset, tmp_path):
     assert "of 2 cells" in text
     code, text, _ = run(capsys, "domain", path, "--json")
     assert [c["place"]["bits"] for c in json.loads(text)["domain"]["cells"]] == [1, 3]
+
+
+def test_an_infinite_score_is_refused_and_a_damaged_domain_measured_again(tiny_dataset, tmp_path, monkeypatch, capsys):
+    """Frames without any light have one; it was stored, and the file could never be read again."""
+    path = weights(tmp_path)
+    scores = iter([20.0, math.inf, 19.0])
+    with monkeypatch.context() as patch:
+        patch.setattr(domain_measurement, "score", lambda *_: next(scores))
+        clips = domain_measurement.clips_of([tiny_dataset], "test")[:1]
+        settings = DomainSettings(clips, (Illumination(ppp=3.25),), ("naive", "moment:3"))
+        with pytest.raises(ValueError, match="or has no score on these clips"):
+            domain_measurement.measure(path, settings, RestoreOptions(device="cpu"))
+    before = tensors_digest(path)
+    annotate(path, {domain.KEY: "{}"})
+    cells_without_measuring(monkeypatch)
+    words = ["domain", path, tiny_dataset, "--device", "cpu"]
+    code, _, said = run(capsys, *words)
+    assert code == 2
+    assert "measure it again with `quiver domain --force`" in said
+    assert run(capsys, *words, "--force")[0] == 0
+    assert len(domain.read_scope(path, metadata_of(path)).domain.cells) == 1  # type: ignore[union-attr]
+    assert tensors_digest(path) == before
