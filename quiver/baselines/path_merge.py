@@ -60,6 +60,7 @@ class Prepared:
 
     codes: Tensor
     pyramid: dict[int, Tensor]
+    size: tuple[int, int]  # of the frame before it was filled
 
 
 def prepared(codes: Array, domain: InformationDomain) -> Prepared:
@@ -69,7 +70,7 @@ def prepared(codes: Array, domain: InformationDomain) -> Prepared:
     frame = functional.pad(torch.from_numpy(codes.astype(np.float32))[None, None], fill, mode="replicate")
     pooled = {scale: functional.avg_pool2d(frame, scale)[0, 0] for scale in SCALES}
     pyramid = {scale: torch.from_numpy(domain.forward(image.numpy())) for scale, image in pooled.items()}
-    return Prepared(frame[0, 0], pyramid)
+    return Prepared(frame[0, 0], pyramid, (height, width))
 
 
 def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: InformationDomain) -> Merged:
@@ -83,7 +84,7 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
         inside = torch.ones_like(moved)
         for i, (frame, offset) in enumerate(zip(window, offsets, strict=True)):
             if offset:
-                moved[i], inside[i] = look(frame.codes, displacement(velocity, acceleration, offset))
+                moved[i], inside[i] = look(frame.codes, displacement(velocity, acceleration, offset), frame.size)
             else:
                 moved[i] = frame.codes
         weight = weights(moved, inside, offsets, domain)

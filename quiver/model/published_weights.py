@@ -168,7 +168,7 @@ def _read_foreign(path: Path) -> dict[str, Tensor]:
         if metadata.get("format") == FORMAT:
             load(path)  # raises for those of a network that was removed
             raise ValueError(f"{path}: holds weights of this program; they need no conversion")
-        return state
+        return {name.removeprefix("module."): value for name, value in state.items()}
     try:
         content = read_torch(path)
     except ValueError as error:

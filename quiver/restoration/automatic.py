@@ -20,6 +20,7 @@ from quiver.restoration.restorers import restorer
 
 NETWORK = "mergenet"
 WITHOUT = "qbp-bm3d"  # without the packages of networks
+MISSING = "needs the package"
 
 
 def chosen(name: str, codes: Codes, options: RestoreOptions | None = None) -> tuple[Restorer, str | None]:
@@ -65,7 +66,7 @@ def _best(codes: Codes, known: dict[str, Restorer], options: RestoreOptions | No
     try:
         network = known.get(NETWORK) or known.setdefault(NETWORK, restorer(NETWORK, options))
     except ModuleNotFoundError as error:
-        return WITHOUT, f"{NETWORK} needs the package {error.name}"
+        return WITHOUT, f"{NETWORK} {MISSING} {error.name}"
     domain = None if network.scope is None else network.scope.domain
     measured, unknown = "", ""
     for part in by_colour(codes):

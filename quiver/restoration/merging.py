@@ -16,15 +16,15 @@ from numpy import ndarray as Array
 from qsim.files import Progress
 from quiver.data.codes import Codes, frame_reader
 from quiver.restoration.interface import RestoreOptions
-from quiver.restoration.pieces import Disagreement, cut_pieces, warn_of_cut
+from quiver.restoration.pieces import Disagreement, cut_pieces, told_of_cut
 
 
 def fill_merged(
     network: Any, codes: Codes, out: Array, first: int, options: RestoreOptions, progress: Progress | None
-) -> None:
+) -> str | None:
     """Restore tile by tile and frame by frame; `out` [t, H, W] must be zero and collects the weighted tiles.
 
-    Where a cut changes the answer (pieces.py), a warning states by how much neighbouring tiles differ.
+    Where a cut changes the answer (pieces.py), the line returned states by how much neighbouring tiles differ.
     """
     from quiver.baselines.information_domain import information_domain
     from quiver.baselines.path_merge import stream
@@ -49,7 +49,7 @@ def fill_merged(
             done += 1
             if progress is not None:
                 progress(done, len(out) * len(pieces.tiles))
-    warn_of_cut(codes, pieces, apart)
+    return told_of_cut(codes, pieces, apart)
 
 
 def corrected(network: Any, merged: Any, domain: Any, options: RestoreOptions) -> Array:

@@ -76,16 +76,17 @@ def fill_mosaic(
     first: int,
     progress: Progress | None,
 ) -> None:
-    """Write the photons of R, G and B of frames `first` ... into out [t, 3, H, W]; `fill` restores one band."""
+    """Write the photons of R, G and B of frames `first` ... into out [t, 3, H, W]; `fill` restores one band.
+
+    `out` is zero. Its first band collects the light of all places: `out` may be a file, and memory hold few frames.
+    """
     assert codes.colour is not None
     rows, columns = codes.colour.tile
-    light = np.zeros((len(out), *codes.shape[1:]), np.float32)
+    light = out[:, 0]
     for n, ((i, j), place) in enumerate(places(codes)):
-        own = np.zeros((len(out), *place.shape[1:]), np.float32)
-        fill(place, own, first, _share(progress, n, rows * columns, len(out)))
-        light[:, i::rows, j::columns] = own
-    for t, frame in enumerate(light):
-        out[t] = codes.demosaiced(frame)
+        fill(place, light[:, i::rows, j::columns], first, _share(progress, n, rows * columns, len(out)))
+    for t in range(len(out)):
+        out[t] = codes.demosaiced(light[t].copy())
 
 
 def _share(progress: Progress | None, n: int, places: int, frames: int) -> Progress | None:

@@ -20,13 +20,14 @@ from quiver.data.noise import noise_table
 from quiver.device import moved, pick_device
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.parts import part_of, takes_clips
-from quiver.restoration.pieces import Disagreement, cut_pieces, warn_of_cut
+from quiver.restoration.pieces import Disagreement, cut_pieces, told_of_cut
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-# Restores into zeros; called with (network, codes, zeros, first, options, progress)
-RestoreNetwork = Callable[[Any, Codes, Array, int, RestoreOptions, Progress | None], None]
+# Restores into zeros, and returns a line on a cut that changes the answer; called with
+# (network, codes, zeros, first, options, progress)
+RestoreNetwork = Callable[[Any, Codes, Array, int, RestoreOptions, Progress | None], str | None]
 EXCESS = 10.0  # times white, or the peak of scores where that is brighter: restored light lies near 0 ... 1
 CONTEXT = 5  # frames that a network needs before and after the one it restores
 
@@ -83,13 +84,16 @@ def wrap_network(
         description = f"{description}; look-ahead {look_ahead} frames"
         seen = min(window, part.seen)
 
-    told: set[str] = set()  # sources whose light was too bright: blocks, windows and places of a mask are told once
+    told: set[tuple[str, str]] = set()  # what, and of which source: blocks, windows and places of a mask are told once
 
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
-        run(model, codes, out, first, options, progress)
-        if run is not fill_merged and codes.source not in told and (text := excess(codes, out, first)):
-            told.add(codes.source)
-            warnings.warn(text, stacklevel=2)
+        found = {"cut": run(model, codes, out, first, options, progress)}
+        if run is not fill_merged and ("excess", codes.source) not in told:
+            found["excess"] = excess(codes, out, first)
+        for what, text in found.items():
+            if text is not None and (what, codes.source) not in told:
+                told.add((what, codes.source))
+                warnings.warn(text, stacklevel=2)
 
     identity = {"weights_sha256": weights_sha256, "mode": mode, "precision": options.precision}
 
@@ -133,10 +137,10 @@ def settings_of(method: Restorer, codes: Codes) -> tuple[str, str]:
 
 def fill_network(
     model: nn.Module, codes: Codes, out: Array, first: int, options: RestoreOptions, progress: Progress | None
-) -> None:
+) -> str | None:
     """Restore tile by tile and frame by frame; `out` [t, H, W] must be zero and collects the weighted tiles.
 
-    Where a cut changes the answer (pieces.py), a warning states by how much neighbouring tiles differ.
+    Where a cut changes the answer (pieces.py), the line returned states by how much neighbouring tiles differ.
     """
     import torch
 
@@ -159,15 +163,15 @@ def fill_network(
                 done += 1
                 if progress is not None:
                     progress(done, len(out) * len(pieces.tiles))
-    warn_of_cut(codes, pieces, apart)
+    return told_of_cut(codes, pieces, apart)
 
 
 def fill_parts(
     network: nn.Module, codes: Codes, out: Array, first: int, options: RestoreOptions, progress: Progress | None
-) -> None:
+) -> str | None:
     """Restore part after part, each tile by tile; `out` [t, H, W] must be zero and collects the weighted tiles.
 
-    Where a cut in space changes the answer (pieces.py), a warning states by how much neighbouring tiles differ.
+    Where a cut in space changes the answer (pieces.py), the line returned states by how much neighbouring tiles differ.
     """
     import torch
 
@@ -198,7 +202,7 @@ def fill_parts(
             done += len(restored)
             if progress is not None:
                 progress(done, len(out) * len(pieces.tiles))
-    warn_of_cut(codes, pieces, apart)
+    return told_of_cut(codes, pieces, apart)
 
 
 def restored_frames(network: Any, frames: Tensor, first: int, last: int, **known: Tensor) -> Tensor:

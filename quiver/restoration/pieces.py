@@ -8,7 +8,7 @@ differs: a warning states by how much.
 
 from __future__ import annotations
 
-import warnings
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -51,19 +51,19 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces
     """Return the cut of a frame for a network and `memory` bytes. `ValueError` if they do not hold a small tile."""
     from quiver.model.quiver import QUIVER
 
-    stated, memory = memory, max(memory - weight_bytes(model), 0)
-    pixels = memory // bytes_per_pixel(model)
     least = int(getattr(model, "least", 1))  # px: smaller tiles are filled to this side
-    if max(height, least) * max(width, least) <= pixels:
+    needed = bytes_needed(model, max(height, least), max(width, least))
+    if needed <= memory:
         return Pieces(cut_tiles(height, width, height * width, 0))
+    stated, memory = memory, max(memory - weight_bytes(model), 0)
+    pixels = pixels_in(model, memory)
     reach = getattr(model, "reach", None)
     if reach is not None:
         return Pieces(cut_tiles(height, width, pixels, reach, int(model.multiple)))  # type: ignore[arg-type]
     if takes_clips(model):  # recurrent, or aligned along any motion: no overlap makes tiles exact
-        needed = bytes_needed(model, height, width)
         tiles = cut_tiles(height, width, pixels, BLENDED, STEP, blend=True, least=least)
         return Pieces(tiles, False, needed, stated)
-    multiple, needed = int(model.multiple), bytes_needed(model, height, width)  # type: ignore[arg-type]
+    multiple = int(model.multiple)  # type: ignore[arg-type]
     if not isinstance(model, QUIVER):
         return Pieces(cut_tiles(height, width, pixels, BLENDED, multiple, blend=True), False, needed, stated)
     step, pixels = max(multiple, model.stride), max(memory - TILING, 0) // bytes_per_pixel(model)
@@ -72,7 +72,22 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces
 
 def bytes_needed(model: nn.Module, height: int, width: int) -> int:
     """Return the working memory of a network for a tile, beside its weights."""
-    return weight_bytes(model) + bytes_per_pixel(model) * height * width
+    pixels = height * width
+    return weight_bytes(model) + bytes_per_pixel(model) * pixels + math.ceil(bytes_per_pair(model) * pixels**2)
+
+
+def pixels_in(model: nn.Module, memory: int) -> int:
+    """Return the pixels of a tile that `memory` bytes hold beside the weights."""
+    each, pair = bytes_per_pixel(model), bytes_per_pair(model)
+    return math.floor(2 * memory / (each + math.sqrt(each**2 + 4 * pair * memory)))  # of pair n^2 + each n = memory
+
+
+def bytes_per_pair(model: nn.Module) -> float:
+    """Return the working memory per pair of pixels of a tile: of MemDeblur, whose frames read five keys' worth.
+
+    Two arrays of float32 hold the nearness of the positions, one per 16 x 16 px, of a frame and of what it reads.
+    """
+    return 2 * 4 * 5 / 256**2 if type(model).__name__ == "MemDeblur" else 0.0
 
 
 def weight_bytes(model: nn.Module) -> int:
@@ -147,18 +162,17 @@ class Disagreement:
         return (float(np.sqrt(np.mean(apart**2))), float(apart.max())) if apart.size else (0.0, 0.0)
 
 
-def warn_of_cut(codes: Codes, pieces: Pieces, apart: Disagreement) -> None:
-    """Warn where a cut changes the answer: by how much tiles differ, and which memory avoids the cut.
+def told_of_cut(codes: Codes, pieces: Pieces, apart: Disagreement) -> str | None:
+    """Return a line where a cut changes the answer: by how much tiles differ, and which memory avoids the cut.
 
-    Tiles that agree may still differ from the uncut frame.
+    None for an exact cut. Tiles that agree may still differ from the uncut frame.
     """
     if pieces.exact:
-        return
+        return None
     rms, most = apart.measured()
     more = f"; --memory {-(-pieces.needed // 10**6)}MB avoids the cut" if pieces.needed else ""
-    warnings.warn(
+    return (
         f"{codes.name}: {pieces.memory / 1e6:.0f} MB hold no frame of {codes.shape[1]} x {codes.shape[2]} px; it is "
         f"cut into {pieces.text}, which differ where they overlap by {100 * rms:.2g} % of white rms, "
-        f"{100 * most:.2g} % at most{more}",
-        stacklevel=3,
+        f"{100 * most:.2g} % at most{more}"
     )

@@ -59,12 +59,16 @@ def displacement(velocity: Tensor, acceleration: Tensor, offset: int, scale: int
     return (velocity * offset + acceleration * (offset * offset / 2)) / scale
 
 
-def look(image: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
-    """Return an image [H, W] seen at p + moved [2, H, W], bilinear, and 1 where that lies inside, else 0."""
+def look(image: Tensor, moved: Tensor, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
+    """Return an image [H, W] seen at p + moved [2, H, W], bilinear, and 1 where that lies inside, else 0.
+
+    Inside are the first rows and columns, `size` of them, of an image that was filled; None: all.
+    """
     height, width = image.shape
+    rows, columns = image.shape if size is None else size
     y = torch.arange(height, dtype=image.dtype)[:, None] + moved[0]
     x = torch.arange(width, dtype=image.dtype)[None] + moved[1]
-    inside = (y >= -0.5) & (y <= height - 0.5) & (x >= -0.5) & (x <= width - 0.5)
+    inside = (y >= -0.5) & (y <= rows - 0.5) & (x >= -0.5) & (x <= columns - 0.5)
     grid = torch.stack([x.mul_(2 / max(width - 1, 1)).sub_(1), y.mul_(2 / max(height - 1, 1)).sub_(1)], dim=-1)
     seen = functional.grid_sample(image[None, None], grid[None], padding_mode="border", align_corners=True)
     return seen[0, 0], inside.to(image.dtype)

@@ -84,7 +84,7 @@ class Attention(nn.Module):
             nearness = nearness / math.sqrt(keys.shape[1])  # [B, n, h w]
             if not self.training and nearness.shape[1] > NEAREST:
                 best = nearness.topk(NEAREST, dim=1)
-                nearness = torch.full_like(nearness, -torch.inf).scatter(1, best.indices, best.values)
+                nearness = nearness.fill_(-torch.inf).scatter_(1, best.indices, best.values)  # no copy: it is large
             return (values @ nearness.softmax(dim=1)).unflatten(2, query.shape[2:])
 
 

@@ -198,3 +198,17 @@ def test_a_shift_of_the_scene_by_a_pixel_shifts_the_answer():
     apart = (one.mean_code[1:, 1:] - other.mean_code[:-1, :-1])[16:-16, 16:-16]
     error = (one.mean_code - SENSOR.mean(np.clip(frames[5], 0, None), EXPOSURE)[:-8, :-8])[16:-16, 16:-16]
     assert np.sqrt((apart**2).mean()) < 0.35 * np.sqrt((error**2).mean())
+
+
+def test_what_lies_beyond_the_picture_has_no_weight(monkeypatch):
+    """A side of 44 px is filled to 48: the four repeated columns counted as pixels of the picture."""
+    velocity = torch.zeros(2, 40, 48)
+    velocity[1] = 4.0
+    monkeypatch.setattr(pm, "paths", lambda *_: (velocity, torch.zeros_like(velocity)))
+    codes = np.random.default_rng(0).integers(0, 8, (11, 40, 44)).astype(np.uint8)
+    found = merged(codes, 5)
+    column = np.arange(44)
+    for group, count in zip(pm.GROUPS, found.group_counts, strict=True):
+        seen = sum(((column + 4 * offset >= 0) & (column + 4 * offset < 44)).astype(int) for offset in group)
+        np.testing.assert_array_equal(count[:40, :44], np.broadcast_to(seen, (40, 44)))
+    assert np.isfinite(found.mean_code).all()

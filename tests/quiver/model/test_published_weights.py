@@ -7,6 +7,7 @@ import pytest
 import torch
 from golden import published_state
 from safetensors import safe_open
+from safetensors.torch import save_file
 
 from quiver.model.presets import PRESETS
 from quiver.model.published_weights import ALIAS, convert_weights, from_published, published_name
@@ -89,6 +90,13 @@ def test_a_checkpoint_is_converted(tmp_path: Path, state, wrap, prefix):
     assert notes(target)["converted_from"] == "their.pth"
     with pytest.raises(FileExistsError, match=r"ours\.safetensors exists"):
         convert_weights(source, target)
+
+
+def test_the_prefix_of_several_devices_is_removed_from_any_kind_of_file(tmp_path: Path, state):
+    source, target = tmp_path / "their.safetensors", tmp_path / "ours.safetensors"
+    save_file({f"module.{name}": value for name, value in state.items() if not ALIAS.match(name)}, source)
+    convert_weights(source, target)
+    assert torch.equal(load(target).alignment.weight, state["pa_deform.weight"])
 
 
 def test_a_checkpoint_in_float64_becomes_float32(tmp_path: Path, state):

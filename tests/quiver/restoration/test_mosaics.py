@@ -1,6 +1,7 @@
 """Tests restoring of mosaics: the parts, every classical method, files, defects, scores, commands."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -156,3 +157,22 @@ def test_one_filter_is_refused_before_any_work(tmp_path, capsys):
     assert main(["restore", str(stream.path), "-o", str(out), "--method", "naive"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not out.parent.exists()
+
+
+def test_the_memory_of_a_mosaic_does_not_grow_with_its_frames(tmp_path):
+    """`out` may be a file: all frames were held twice beside it."""
+    stream = colour_clip(tmp_path / "c", frames=40, height=64, width=64).sense(SENSOR, ppp=6.0, colour="rggb", name="m")
+    codes = stream_codes(stream)
+
+    def fill(place, light, first, progress):
+        light += 1.0
+
+    peaks = []
+    for frames in (1, 5, 40):  # the first one imports, and makes tables that stay
+        out = np.zeros((frames, 3, 64, 64), np.float32)
+        tracemalloc.start()
+        fill_mosaic(fill, codes, out, 0, None)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert (out > 0).all()
+    assert peaks[2] - peaks[1] < 35 * 64 * 64 * 4 / 4  # a quarter of the light of the other frames
