@@ -27,6 +27,7 @@ from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.sensor import Sensor
 from quiver.data.illumination import Illumination, read_sensor
 
+OTHERS = "give --sensor, --bits and --ppp, in Python WindowSettings(lights=...)"  # where a stream's noise is of no use
 NODES = 4097  # of a table; between nodes the variance is read along straight lines
 
 
@@ -63,19 +64,12 @@ class Noise(Illumination):
         meta, where = stream.meta, stream.path.with_suffix(".json")
         planes = meta.get("planes_per_code") or 1
         if planes != 1:
-            raise ValueError(
-                f"{where}: a code takes {planes} clip frames, a training window one for each; give --sensor, --bits "
-                "and --ppp"
-            )
+            raise ValueError(f"{where}: a code takes {planes} clip frames, a training window one for each; {OTHERS}")
         if stream.rows is not None:
-            raise ValueError(
-                f"{where}: its rows have their own time, those of a training window have one; give --sensor, --bits "
-                "and --ppp"
-            )
+            raise ValueError(f"{where}: its rows have their own time, those of a training window have one; {OTHERS}")
         if stream.shares is not None:
             raise ValueError(
-                f"{where}: its codes have different exposures, those of a training window have one; give --sensor, "
-                "--bits and --ppp"
+                f"{where}: its codes have different exposures, those of a training window have one; {OTHERS}"
             )
         name = str(meta.get("sensor_name") or stream.sensor.to_dict()["model"])
         named = "sensor_name" in meta and not name.endswith(".toml")

@@ -51,6 +51,7 @@ class WindowSettings:
 
     lights: tuple[Illumination, ...] | None = None  # each sample draws one; None: those of the clips' streams
     frames: int = 11
+    least: int = 1  # frames that the network needs, for advice
     crop: int = 64  # px, side of the square; validation takes the centre
     flips: bool = True  # the eight flips and quarter turns
     reverse: bool = True  # half of the windows run backwards in time
@@ -170,6 +171,10 @@ class Windows(Dataset[dict[str, Any]]):
         order = np.random.default_rng(0).permutation(clips)  # so that the light does not follow the order of clips
         return [n * lights // count * clips + int(order[n % clips]) for n in range(count)]
 
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """Yield the windows of the first epoch."""
+        return (self[n] for n in range(len(self)))
+
     def __getitem__(self, n: int) -> dict[str, Any]:
         place = self.place(n)
         clip, noise = self.clips[place.clip], self.noise.noises[place.light]
@@ -202,7 +207,7 @@ class Windows(Dataset[dict[str, Any]]):
             f"{'backwards, ' if place.backwards else ''}{noise.label}, {place.key}",
         }
         if self.settings.still:
-            resting = np.broadcast_to(photons[len(photons) // 2] * scale, photons.shape)
+            resting = np.broadcast_to(self._at_rest(place) * scale, photons.shape)
             key = replace(place.key, stage=STILL + place.key.stage)
             sample["still"] = as_input(draw_codes(behind, resting, clip.exposure, key), draw.sensor)
         if self.prepare is None:
@@ -234,6 +239,15 @@ class Windows(Dataset[dict[str, Any]]):
         return turned(exposed, place), turned(
             taken(sharp=True) if has_sharp(clip) or draw.diffraction else exposed, place
         )
+
+    def _at_rest(self, place: WindowPlace) -> Array:
+        """Return the photons [h, w] of the centre frame, turned, of a scene that rests there: without motion blur."""
+        clip, side, frames = self.clips[place.clip], self.settings.crop, self.settings.frames
+        (dy, dx), (draw, _, _) = place.drift, self._draw(place)
+        i = frames - 1 - frames // 2 if place.backwards else frames // 2
+        crop = (place.y + dy * i, place.x + dx * i, side, side)
+        instant = {"sharp": has_sharp(clip), "diffraction": draw.diffraction}
+        return turned(clip_photons(clip, place.start + i, draw.level.factor, crop, **instant)[None], place)[0]
 
     def _draw(self, place: WindowPlace) -> tuple[Draw, Array | None, Sensor]:
         """Return what draws the codes of a place's clip and noise, its defective pixels, and the sensor behind them."""
@@ -287,17 +301,19 @@ def as_input(codes: Array, sensor: Sensor) -> torch.Tensor:
 
 
 def check_clips(clips: Sequence[Clip], settings: WindowSettings) -> None:
-    """Raise `ValueError` with the first clip that holds no window."""
+    """Raise `ValueError` with the first clip that holds no window; its advice is for a network with this `least`."""
     if not clips:
         raise ValueError("no complete clip to draw windows from; check the split, or finish `qsim generate`")
     for clip in clips:
         clip.require_one_band("training")
         length, height, width = clip.shape
         if length < settings.frames or min(height, width) < settings.crop:
-            less = "fewer --frames" if length < settings.frames else "a smaller --crop"
+            less = "choose fewer --frames" if length < settings.frames else "choose a smaller --crop"
+            longer = f"give clips of {settings.least} frames or more"
+            advice = longer if length < settings.least else f"{less}, or other clips"
             raise ValueError(
                 f"clip {clip.name} is {length} x {height} x {width}; a window needs {settings.frames} frames of "
-                f"{settings.crop} x {settings.crop} px; choose {less}, or other clips"
+                f"{settings.crop} x {settings.crop} px; {advice}"
             )
 
 

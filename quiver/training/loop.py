@@ -52,11 +52,12 @@ class Diverged(RuntimeError):
 
 
 def make_windows(
-    settings: Settings, multiple: int, system: System = OURS, frames: int | None = None
+    settings: Settings, multiple: int, system: System = OURS, frames: int | None = None, least: int = 1
 ) -> tuple[Windows, Subset[dict[str, Any]]]:
     """Return training and fixed validation windows; without validation clips the training clips, with a warning.
 
     Sides of validation windows are multiples of `multiple`; they have `frames` frames, by default those of the system.
+    `least` frames is the shortest window of the network.
     """
     window = WindowSettings(
         lights=settings.noise,
@@ -68,6 +69,7 @@ def make_windows(
         force_exposure=settings.force_exposure,
         still=system.still,
         seed=settings.seed,
+        least=least,
     )
     training, validation = split_clips(settings.data, settings.validation_split)
     windows = Windows(training, window, prepare=system.prepare)
@@ -298,7 +300,7 @@ def train(
         else:
             settings, lines = settled(settings, force=force)
             settings = replace(settings, threads=threads.use(asked, settings.threads).number)
-            windows, fixed = make_windows(settings, system.side(model), system, validated)
+            windows, fixed = make_windows(settings, system.side(model), system, validated, system.window(model))
             lines += unfinished(settings.folders)
         conditions = {"processes": process.world, "computes_in": precision_of(settings, process.device)}
         run = Run(settings, conditions | {"clips": source_digest(windows, fixed), "validated_frames": validated})

@@ -63,8 +63,12 @@ def joined(device: str) -> Iterator[Process]:
 
 
 def begin_worker(number: int) -> None:
-    """Ignore Ctrl-C in a worker: the process that trains ends after its step, saves, and stops its workers."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Ignore Ctrl-C and termination in a worker, which job managers send to all processes of a run.
+
+    The process that trains ends after its step, saves, and stops its workers.
+    """
+    for number_of_signal in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number_of_signal, signal.SIG_IGN)
 
 
 @contextlib.contextmanager

@@ -60,6 +60,11 @@ def _load_weights(model: nn.Module, stored: Any) -> None:
     model.load_state_dict(stored)
 
 
+def _alone(value: Any) -> Any:
+    """Return the value of a list of one: a protocol names one sensor, and --sensor a list."""
+    return value[0] if isinstance(value, list) and len(value) == 1 else value
+
+
 @contextlib.contextmanager
 def alone_in(folder: Path, doing: str) -> Iterator[None]:
     """Hold the lock of a folder of results; `ValueError` if another process holds it."""
@@ -139,7 +144,7 @@ class Run:
         wanted, found = self.settings.to_dict(), read_json(self.folder / "settings.json")
         free = {"out", "workers", "threads"} | ({"noise"} - found.keys())  # earlier versions wrote no noise
         for name in wanted:
-            if name not in free and found.get(name) != wanted[name]:
+            if name not in free and _alone(found.get(name)) != _alone(wanted[name]):
                 before = "as in its data set" if found.get(name) is None else short(found[name])
                 raise FileExistsError(
                     f"{self.folder} holds a run with {name} {before}, now it is {short(wanted[name])}; choose "

@@ -72,6 +72,9 @@ class System:
             )
         if self.of_stream and settings.schedule == "plateau":
             raise ValueError(f"--schedule plateau: follows validations, and {self.name} has none; leave it out")
+        if settings.schedule == "plateau" and settings.steps is None:
+            raise ValueError("--schedule plateau: a run that --minutes ends has ten validations, too few for it; give "
+                             "--steps, or leave it out")  # fmt: skip
         self.check(network, settings)
 
 

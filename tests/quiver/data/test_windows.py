@@ -285,3 +285,29 @@ def test_loaders_of_the_pages_draw_new_noise_in_every_epoch(file: str):
     made = [line for line in (ROOT / file).read_text().splitlines() if "DataLoader(" in line]
     assert len(made) == 1
     assert "batch_sampler=Batches(8, first=0, last=" in made[0]
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_scene_at_rest_has_no_motion_blur(make_clip: ClipMaker, reverse):
+    """Codes of a bright scene, nearly free of noise, equal the centre frame of the target and not the exposed one."""
+    clip = make_clip(sharp=True)
+    light = Illumination(sensor="quiver-physical", ppp=2e4, bits=14)
+    data = Windows([clip], WindowSettings(lights=(light,), crop=16, reverse=reverse, drift=2, still=True, seed=3))
+    for n in range(6):
+        sample = data[n]
+        sensor, white = light.device(clip.exposure), float(sample["white"])
+        found = sensor.response(clip.exposure).invert(sample["still"].mean(0)[0].numpy() * (sensor.levels - 1), 11)
+        target = sample["target"][5, 0].numpy() * white
+        assert np.abs(found / target - 1).max() < 6 / np.sqrt(11 * 0.5 * target.min())  # the exposed frame: 0.1
+
+
+@pytest.mark.parametrize(("least", "advice"), [(11, "give clips of 11 frames or more"), (1, "choose fewer --frames")])
+def test_the_advice_for_short_clips_can_be_followed(make_clip: ClipMaker, least, advice):
+    with pytest.raises(ValueError, match=f"a window needs 11 frames .*; {advice}"):
+        Windows([make_clip(frames=8)], WindowSettings(crop=16, least=least))
+
+
+def test_windows_can_be_listed(make_clip: ClipMaker):
+    """The loop never ended."""
+    data = three_clips(make_clip)
+    assert len(list(data)) == len(data) == 6

@@ -145,8 +145,9 @@ def test_batches_know_their_workers(tiny_dataset, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_ctrl_c_reaches_all_processes_and_the_state_is_saved(tiny_dataset, tmp_path):
-    """A terminal sends it to the workers too."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_reaches_all_processes_and_the_state_is_saved(tiny_dataset, tmp_path, number):
+    """A terminal sends it to the workers too, and job managers send them the other."""
     words = ["-m", "quiver", "train", str(tiny_dataset), "-o", str(tmp_path / "r"), "--preset", "unet", "--steps"]
     words += ["100000", "--crop", "16", "--batch", "1", "--validate-every", "3", "--workers", "1", "--threads", "1"]
     with subprocess.Popen(
@@ -155,7 +156,7 @@ def test_ctrl_c_reaches_all_processes_and_the_state_is_saved(tiny_dataset, tmp_p
         end = time.monotonic() + 120
         while not (tmp_path / "r/history.json").exists() and process.poll() is None and time.monotonic() < end:
             time.sleep(0.2)
-        os.killpg(process.pid, signal.SIGINT)
+        os.killpg(process.pid, number)
         _, said = process.communicate(timeout=120)
     assert (process.returncode, said.splitlines()) == (
         130,

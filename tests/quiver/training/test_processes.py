@@ -11,13 +11,15 @@ from torch._utils import ExceptionWrapper
 from quiver.training.processes import begin_worker, plain_errors
 
 
-def test_workers_ignore_ctrl_c():
-    before = signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_workers_ignore_ctrl_c_and_termination(number):
+    before = {known: signal.getsignal(known) for known in (signal.SIGINT, signal.SIGTERM)}
     try:
         begin_worker(0)
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for known, handler in before.items():
+            signal.signal(known, handler)
 
 
 def wrapped(error: Exception) -> ExceptionWrapper:
