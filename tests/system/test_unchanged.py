@@ -521,6 +521,9 @@ def _taken(folder: Path, sensor: Sensor, name: str, photons: Iterable[tuple[floa
     return words
 
 
+FITTED = 1e-6  # a least squares fit is determined to the root of the rounding, 1e-8: another processor gave 5e-7
+
+
 @section()
 def calibrations(folder: Path) -> Results:
     lit = ((1e-3, 0.0), (5e-2, 0.0), (1e-3, 0.7), (1e-3, 2.5), (1e-3, 7.0))
@@ -535,13 +538,13 @@ def calibrations(folder: Path) -> Results:
         words = _taken(folder, sensor, name, lit, frames)
         found = run(qsim.cli.main, f"calibrate -q {line}", *words, "-o", folder / f"{name}.toml")
         del found["files"]
-        yield name, Near(np.array(list(numbers(found))), 1e-9, "each")
+        yield name, Near(np.array(list(numbers(found))), FITTED, "each")
     light = np.broadcast_to(np.linspace(1.0, 30.0, 15 * 17).reshape(15, 17), (80, 15, 17))
     np.save(folder / "static.npy", CountingSPAD(0.5, 0.0, 3e-5, 8).sample(light, 1e-3, key=Key(1, 1)))
     words = ["--static", folder / "static.npy", "1e-3", "-o", folder / "static.toml"]
     found = run(qsim.cli.main, "calibrate -q --bits 8", *words)
     del found["files"]
-    yield "static", Near(np.array(list(numbers(found))), 1e-9, "each")
+    yield "static", Near(np.array(list(numbers(found))), FITTED, "each")
 
 
 @section()
