@@ -112,7 +112,7 @@ TESTS = """## Which test checks which claim
 | photons are computed correctly: worked numbers, EMVA formula, laws | `tests/qsim/optics/test_radiometry.py` |
 | radiance of a closed box and of a Lambertian plane | `test_renderer.py`, `test_mitsuba_scene.py` |
 | stated error of a frame agrees with the true one | `test_renderer.py`, `test_fidelity.py`, `test_fidelity_white.py` |
-| mean light agrees with a converged frame's within the announced error | `test_idle_options.py`, `test_denoiser.py` |
+| mean light agrees with a converged frame's within the announced error | `test_light.py`, `test_denoiser.py` |
 | compiled and reference engine agree over 10 000 random sensors | `tests/qsim/sensor/compiled/test_codes_search.py` |
 | codes have the exact distribution: tails, ties, dead times | `tests/qsim/sensor/test_qis.py`, `test_counting.py` |
 | closed forms agree with the simulation of every photon | `tests/qsim/sensor/defects/test_event_simulation.py` |

@@ -12,6 +12,7 @@ otherwise:
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import json
 import os
 import re
@@ -68,10 +69,10 @@ def place(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-def commands() -> list[list[str]]:
+def commands(*pages: Path) -> list[list[str]]:
     """The qsim and quiver command lines of all shell blocks, continued lines joined, comments and redirections off."""
     found = []
-    for path in DOCUMENTS:
+    for path in pages or DOCUMENTS:
         for block in blocks(path):
             if block.language != "sh":
                 continue
@@ -285,3 +286,18 @@ def test_tests_named_as_evidence_exist():
     there = {path.name for path in (ROOT / "tests").rglob("test_*.py")}
     assert len(names) >= 10
     assert set(names) <= there
+
+
+def test_pages_that_are_read_one_after_another_do_not_share_results():
+    """The second page ended with `out/fan: exists`. Commands that resume may share a place."""
+    pages = (ROOT / "README.md", ROOT / "docs" / "start.md", ROOT / "docs" / "training.md")
+    resumed = {"out/data", "out/mine"}
+    found = [{target for words in commands(page) for target in targets(words)} - resumed for page in pages]
+    for i, one in enumerate(found):
+        for other in found[i + 1 :]:
+            assert not one & other
+
+
+def targets(words: list[str]) -> set[str]:
+    """Return what follows -o in a command."""
+    return {name for option, name in itertools.pairwise(words) if option in ("-o", "--output")}
