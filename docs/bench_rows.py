@@ -17,6 +17,8 @@ import math
 import subprocess
 import sys
 import tempfile
+import textwrap
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,7 +40,10 @@ from rows import (
 
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
+from quiver.device import default_memory
+from quiver.model.presets import build
 from quiver.restoration.interface import COMPARED
+from quiver.restoration.pieces import cut_pieces
 
 CLASSICAL = ("moment", "transform-denoise", "qbp", "qbp-bm3d", "path-merge")
 SMALL = ("emvd", "unet", "fastdvdnet", "student-teacher")  # of published width, with fewer multiply-adds than a million
@@ -122,8 +127,8 @@ def write_page(out: Path) -> None:
     modes = rows.pop(MODES, None)
     text = ["# What a restored frame costs", "", "Made by `python docs/bench_rows.py`.", ""]
     if rows:
-        size = next(iter(rows.values()))["plan"]["size"].replace("x", " x ")
-        text += [f"## Frames of {size} px", "", NOTES, ""]
+        size = next(iter(rows.values()))["plan"]["size"]
+        text += [f"## Frames of {size.replace('x', ' x ')} px", "", NOTES, *tiles_line(rows, size), ""]
         found = [[starred(row), *cells(row["costs"][0])] for row in sorted(rows.values(), key=seconds)]
         text += [*markdown_table(found, HEADER), ""]
     if modes is not None:
@@ -141,6 +146,21 @@ Networks of a million multiply-adds per pixel and frame end in `-1m`; their weig
 PSNR. Those that restore a clip in parts are charged with the frames around a part, too. Methods that search motion take
 another time on other clips."""
 MODE_NOTES = "`exact` shares work between windows and gives the numbers of `windows`; `streaming` keeps its state."
+
+
+def tiles_line(names: Iterable[str], size: str) -> list[str]:
+    """Return a line on the networks whose frames the memory bound cuts into tiles that overlap; none without any."""
+    import torch
+
+    height, width = (int(side) for side in size.split("x"))
+    cuts = {}
+    for name in sorted({*names} - {*CLASSICAL}):
+        with torch.device("meta"):
+            cuts[name] = len(cut_pieces(build(name), height, width, default_memory("cpu")).tiles)
+    cut = ", ".join(f"{name} {tiles}" for name, tiles in cuts.items() if tiles > 1)
+    bound = f"{default_memory('cpu') / 1e9:g} GB"
+    text = f"The bound of {bound} cuts a frame into tiles, whose overlap is counted, too: {cut}."
+    return textwrap.wrap(text, 118) if cut else []
 
 
 def seconds(row: dict[str, Any]) -> float:
