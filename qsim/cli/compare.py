@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,7 +37,10 @@ def _run_compare(args: argparse.Namespace) -> int:
     found = readouts.compare(Clip.open(args.clip), args.streams or (), args.span)
     lines = text_table([_cells(row) for row in found.rows], _HEADER, left=2)
     head = f"{found.clip}: {len(found.instants)} instants, {found.span * 1e3:.4g} ms each, against the sharp light"
-    output(args, asdict(found), [head, *lines, *found.remarks])
+    rows = [asdict(row) for row in found.rows]
+    for row in rows:
+        row["psnr_db"] = row["psnr_db"] if math.isfinite(row["psnr_db"]) else None  # JSON has no infinity
+    output(args, asdict(found) | {"rows": rows}, [head, *lines, *found.remarks])
     return 0
 
 

@@ -57,11 +57,11 @@ def card(text: str, picture: Array) -> str:
 
 
 def figure(pictures: Array, caption: str, fps: float = 12.0) -> str:
-    """Return pictures, uint8 [T, H, W] or [T, H, W, 3], as an HTML figure: a PNG, or a GIF without loss."""
+    """Return pictures, uint8 [T, H, W] or [T, H, W, 3], as an HTML figure: a PNG, of several grey ones a GIF."""
     from PIL import Image
 
     images = [Image.fromarray(picture) for picture in pictures]
-    kind, buffer = ("gif" if len(images) > 1 else "png"), io.BytesIO()
+    kind, buffer = ("gif" if len(images) > 1 and pictures.ndim == 3 else "png"), io.BytesIO()  # a GIF has 256 colours
     animated = {"save_all": True, "append_images": images[1:], "duration": round(1000 / fps), "loop": 0}
     images[0].save(buffer, kind, **(animated if len(images) > 1 else {}))
     source = f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -200,12 +200,19 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
             raise ValueError(f"{folder}: was made from another recipe, without the clip {job.name}; use another folder")
         if old[job.name]["digest"] == job.digest_with():
             raise ValueError(_of_earlier_version(folder))
-        if old[job.name]["digest"] != job.digest:
+        if old[job.name]["digest"] != job.digest and _is_made(folder, job):
             raise ValueError(f"{folder}: its clip {job.name} was made with other settings; use another folder")
     extra = sorted(set(old) - {job.name for job in recipe.jobs})
     if extra:
         raise ValueError(f"{folder}: holds the clip {extra[0]}, which is not in this recipe; use another folder")
+    if any(old[job.name]["digest"] != job.digest for job in recipe.jobs):  # edited before their clips were made
+        write_manifest(recipe, folder)
     return ()
+
+
+def _is_made(folder: Path, job: Job) -> bool:
+    """Return whether a job's clip exists, recorded or not."""
+    return record_path(folder, job.name).is_file() or any((folder / at / job.name).exists() for at in ("clips", "work"))
 
 
 def _of_earlier_version(folder: Path) -> str:
@@ -292,7 +299,10 @@ def _is_data_set(folder: Path) -> bool:
 
 
 def _failures(folder: Path, jobs: Sequence[Job]) -> dict[str, str]:
-    """Return why unfinished jobs failed before; an unreadable note counts. Delete the notes of finished jobs."""
+    """Return why unfinished jobs failed before; an unreadable note counts, one of other settings does not.
+
+    Notes of finished jobs are deleted.
+    """
     found = {}
     for job in jobs:
         path = failure_path(folder, job.name)
@@ -300,7 +310,9 @@ def _failures(folder: Path, jobs: Sequence[Job]) -> dict[str, str]:
             path.unlink(missing_ok=True)
         elif path.is_file():
             try:
-                found[job.name] = str(files.read_json(path).get("error", f"{path}: does not say why"))
+                note = files.read_json(path)
+                if note.get("digest", job.digest) == job.digest:
+                    found[job.name] = str(note.get("error", f"{path}: does not say why"))
             except ValueError as error:
                 found[job.name] = files.wording(error)
     return found

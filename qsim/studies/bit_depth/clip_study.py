@@ -132,7 +132,7 @@ def expose(
         pair = [photons] if reach == 0 else [clip_photons(clip, t, factor) for t in places]
         for t, light in zip(places, pair, strict=True):
             p = plane.pmf(light, clip.exposure)
-            fired += plane.sample(light, clip.exposure, key=key.at(t))
+            fired += plane.sample(light, clip.exposure, key=key.at(t), origin=clip.origin)
             total, quiet, spread = total + light, quiet + p[..., 0], spread + p[..., 0] * p[..., 1]
         if reach:
             structure[2 * reach - 1] += np.mean((pair[0] - before) ** 2)
@@ -227,7 +227,7 @@ def study(clip: Clip, settings: StudySettings, *, progress: Callable[[int, int],
 def _read(clip: Clip, form: Readout, frame: Exposed, centre: int, settings: StudySettings) -> Array:
     """Return the codes of one multi-bit read of the summed light, [H, W]; stage 1 of the key (planes: stage 0)."""
     key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name), frame=centre, stage=1)
-    return form.sensor.sample(frame.photons, form.exposure, key=key)
+    return form.sensor.sample(frame.photons, form.exposure, key=key, origin=clip.origin)
 
 
 def clip_motion(clip: Clip, t: int, speed: int = 1) -> float | None:

@@ -142,7 +142,7 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings, *, force: b
         grouped = group(clip, path, m, force=force)
         sense(grouped, read)
         key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
-        draw = Draw(replace(plane, bits=bits), plane, level, key, m, False)
+        draw = Draw(replace(plane, bits=bits), plane, level, key, m, False, origin=clip.origin)
         # A code is one frame of `grouped`: its exposure is m times longer, which relative light does not know.
         more, before = (m, 1) if clip.camera is None else (1, m)
         of_code = replace(level, factor=more * level.factor, ppp=m * level.ppp, mean_before=before * level.mean_before)
@@ -167,5 +167,7 @@ def group(clip: Clip, path: Path, m: int, *, force: bool = False) -> Clip:
             cut = None
             if clip.meta.get("saturated_pixels"):
                 cut = np.any([clip.saturated(t * m + i) for i in range(m)], axis=0)
-            writer.add(t, np.asarray(mean, np.float32), clip.sharp(t * m + m // 2) if m > 1 else None, saturated=cut)
+            middle = t * m + m // 2
+            sharp = clip.sharp(middle) if m > 1 or f"sharp/{middle:06d}.exr" in clip.meta["checksums"] else None
+            writer.add(t, np.asarray(mean, np.float32), sharp, saturated=cut)
     return Clip.open(path)

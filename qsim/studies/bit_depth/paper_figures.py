@@ -59,7 +59,7 @@ def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
         first = middle - n // 2
         light = np.sum([clip_photons(clip, t, level.factor) for t in range(first, first + n)], axis=0)
         sensor = devices.load(name, exposure=n * clip.exposure)
-        codes = sensor.sample(light, n * clip.exposure, key=key)
+        codes = sensor.sample(light, n * clip.exposure, key=key, origin=clip.origin)
         found, where = np.unique(codes, return_inverse=True)  # few of the 1024 codes of a deep pixel occur
         estimates = sensor.maximum_likelihood(found[:, None] == np.arange(sensor.levels), n * clip.exposure).photons
         image = estimates[where].reshape(codes.shape) / n

@@ -144,3 +144,13 @@ def test_the_dark_counts_of_hot_pixels_are_not_subtracted_from_all(tmp_path, cap
     assert {row.stream: row.psnr_db for row in found.rows}["hot"] == pytest.approx(expected, abs=0.01)
     assert main(["compare", str(clip.path)]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == found.remarks[0]
+
+
+def test_light_without_an_error_is_json_too(tmp_path, capsys):
+    """One frame per code and no noise: the PSNR of the light is infinite, which JSON does not know."""
+    clip = write_clip(tmp_path / "c", frames=4, height=5, width=8)
+    clip.sense(EXACT, ppp=90.0, name="s")
+    assert main(["compare", str(clip.path), "--json"]) == 0
+    light, stream = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["rows"]
+    assert light["psnr_db"] is None
+    assert stream["psnr_db"] > 0

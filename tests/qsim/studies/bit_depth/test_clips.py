@@ -114,3 +114,18 @@ def test_planes_that_cannot_be_summed_are_refused_before_the_study(clip, tmp_pat
     assert main([*words, "--streams", "-o", str(tmp_path / "out")]) == 2
     assert "need a clocked SPAD; leave out the plane sensor" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_one_plane_of_an_open_shutter_keeps_its_sharp_instant(tmp_path):
+    """A frame of one bit was scored against blurred light, deeper ones against the sharp instant."""
+    open_clip = write_clip(tmp_path / "c", frames=6, height=5, width=8, sharp=True)
+    for m in (1, 3):
+        grouped = group(open_clip, tmp_path / f"by{m}", m)
+        assert np.array_equal(grouped.sharp(1), open_clip.sharp(m + m // 2))
+
+
+def test_streams_of_a_crop_have_the_noise_of_its_place(tmp_path):
+    clip = write_clip(tmp_path / "c", frames=14, height=12, width=16, frame_rate=10_000.0, origin=[8, 12])
+    (path,) = write_streams(clip, tmp_path, StudySettings(bits=(3,), ppp=0.65))
+    found = Clip.open(path)
+    assert found.stream("planes").origin == found.stream("multibit").origin == (8, 12)
