@@ -57,33 +57,35 @@ def read_cube(path: Path, hints: Hints) -> Recording:
     if array.dtype != np.uint8 or array.ndim != 3:
         raise ValueError(f"{path}: a photon cube is uint8 [T, H, bytes], found {array.dtype} {list(array.shape)}")
     frames, height, columns = check_shape(path, array.shape)
-    width = hints.width if hints.width is not None else written_width(path, description) or 8 * columns
+    known = written_with(path, description) or {}
+    width = hints.width if hints.width is not None else known.get("shape", (0, 0, 8 * columns))[2]
     if not 8 * (columns - 1) < width <= 8 * columns:
         raise ValueError(f"{path}: {columns} bytes per row hold {8 * columns - 7} to {8 * columns} pixels, not {width}")
 
     def read(start: int, stop: int) -> Array:
         return np.unpackbits(np.asarray(array[start:stop]), axis=-1, count=width)
 
-    return Recording((frames, height, width), read, "photon cube", 1, meta={"bit_order": "msb"})
+    meta = {"bit_order": "msb"} | {key: known[key] for key in ("orientation",) if isinstance(known.get(key), str)}
+    return Recording((frames, height, width), read, "photon cube", 1, meta=meta)
 
 
-def written_width(path: Path, description: str) -> int | None:
-    """Return the width in a description, NAME.npy.json, if `qsim convert` wrote it beside a photon cube; else None."""
+def written_with(path: Path, description: str) -> dict[str, Any] | None:
+    """Return a description, NAME.npy.json, if `qsim convert` wrote it beside a photon cube; else None."""
     try:
         found = files.read_json(path.with_name(description))
     except (OSError, ValueError):
         return None
     software, shape = found.get("software"), found.get("shape")
     ours = isinstance(software, dict) and "qsim" in software and list_of(is_whole, 3)(shape)
-    return int(found["shape"][2]) if ours else None
+    return found if ours else None
 
 
 def read_codes_npy(path: Path, hints: Hints) -> Recording:
-    """Read unpacked codes: bool or unsigned [T, H, W], one code per pixel; bits as given, 1 for bool."""
+    """Read unpacked codes: bool or whole numbers [T, H, W], one code per pixel; bits as given, 1 for bool."""
     array = load_array(path)
     frames, height, width = check_shape(path, array.shape)
     bits = 1 if array.dtype == bool else hints.bits
-    if bits is None or array.dtype.kind not in "bu":
+    if bits is None or array.dtype.kind not in "bui":
         raise ValueError(f"{path}: {array.dtype} codes need a number of bits, as in --bits 3")
 
     def read(start: int, stop: int) -> Array:
@@ -96,6 +98,8 @@ def read_light_npy(path: Path, hints: Hints) -> Recording:
     """Read numbers [T, H, W] as light: integers by --transfer (full scale of their type), floats are linear."""
     array = load_array(path)
     shape = check_shape(path, array.shape)
+    if array.dtype == bool:
+        raise ValueError(f"{path}: bool values are codes of one bit, not light; leave --layout out")
     floats = array.dtype.kind == "f"
     transfer = "linear" if floats and hints.transfer is None else need_transfer(path, hints)
     top = 1.0 if floats else float(np.iinfo(array.dtype).max)
@@ -191,7 +195,7 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
         raise FileNotFoundError(f"{path}: has no transforms.json; a recording of visionsim is a folder with one")
     with decoding_errors(description, "JSON"):
         info = json.loads(description.read_text("utf-8"))
-        width, channels = int(info["w"]), int(info.get("c", 1))
+        width = int(info["w"])
         packed = bool(info.get("bitpack", "bitpack_dim" in info or info.get("bitplanes", 1) == 1))
         planes = None if info.get("bitplanes") is None else int(info["bitplanes"])
         if packed and int(info.get("bitpack_dim", 2)) != 2:
@@ -199,7 +203,8 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     shards = [path / "frames.npy"] if (path / "frames.npy").is_file() else numbered(list(path.glob("[0-9]*.npy")))
     if not shards:
         raise FileNotFoundError(f"{path}: holds neither frames.npy nor 0000.npy")
-    channel = hints.channel or 0
+    channel, first = hints.channel or 0, load_array(shards[0])
+    channels = first.shape[3] if first.ndim == 4 else 1
     if channels > 1 and hints.channel is None:
         raise ValueError(f"{path}: {channels} colour planes; choose one with --channel 0")
     parts = []
@@ -217,6 +222,11 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     else:
         bits = hints.bits or 1 if planes is None else _bits_of_sums(description, planes, hints.bits)
     ends = np.cumsum([len(part) for part in parts])
+    stated = info.get("frames")
+    if isinstance(stated, list) and stated and len(stated) != int(ends[-1]):
+        raise ValueError(
+            f"{path}: {int(ends[-1])} frames, and transforms.json states {len(stated)}; add the shards that are missing"
+        )
     shape = check_shape(path, (int(ends[-1]), parts[0].shape[1], width))
 
     def read(start: int, stop: int) -> Array:
@@ -266,7 +276,7 @@ def write_zarr(folder: Path, blocks: Iterator[Array], shape: tuple[int, int, int
     """Write a zarr v3 group with `frames` [T, H, W] in chunks of full frames, as quanta-spad-sim stores them."""
     import zarr
 
-    group = zarr.open_group(str(folder), mode="w", zarr_format=3)
+    group = zarr.open_group(str(folder), mode="a", zarr_format=3)  # "w" would delete the mark of our exports
     group.attrs.update(attributes)
     per_chunk = max(1, min(max(shape[0], 1), (8 << 20) // (shape[1] * shape[2])))
     array = None

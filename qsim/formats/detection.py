@@ -120,7 +120,9 @@ def _detect_folder(path: Path) -> str:
         return "mat"
     shown = sorted(file for file in path.iterdir() if file.suffix.lower() in PICTURES and file.name[0] != ".")
     raw = sorted(path.rglob("*.bin"))
-    kinds = {PICTURES[file.suffix.lower()]: file for file in shown} | ({"raw": raw[0]} if raw else {})
+    arrays = sorted(file for file in path.iterdir() if file.suffix.lower() in (".npy", ".npz", ".dat", ".mat"))
+    kinds = {PICTURES[file.suffix.lower()]: file for file in shown}
+    kinds |= {kind: found[0] for kind, found in (("raw", raw), ("array", arrays)) if found}
     if len(kinds) > 1:
         first, second, *_ = kinds.values()
         raise ValueError(f"{path}: holds recordings of two kinds ({first}, {second}); choose with --layout")
@@ -138,8 +140,8 @@ def _detect_npy(path: Path, hints: Hints) -> str:
     if hints.transfer is not None or hints.white is not None:
         return "light"
     if array.dtype != np.uint8:
-        return "codes" if hints.bits is not None and array.dtype.kind == "u" else "light"
-    if array.ndim == 4 or hints.width is not None or array_files.written_width(path, f"{path.name}.json") is not None:
+        return "codes" if hints.bits is not None and array.dtype.kind in "ui" else "light"
+    if array.ndim == 4 or hints.width is not None or array_files.written_with(path, f"{path.name}.json") is not None:
         return "cube"
     top = max((int(array[t].max()) for t in range(len(array)) if array[t].size), default=0)
     bits = max(top.bit_length(), 1)

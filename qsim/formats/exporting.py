@@ -110,7 +110,11 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
 
 
 _MARK = {"software": {"qsim": VERSION}}  # in every description of an export: this program wrote it
-_NAMES = r"(meta|transforms)\.json|[0-9]{6,}\.(png|exr|npy)|zarr\.json|frames/zarr\.json|frames/c/[0-9]+/[0-9]+/[0-9]+"
+_UNFINISHED = r"[0-9a-f]{32}\.partial"  # zarr's ending of a file that it is writing
+_NAMES = (
+    r"(meta|transforms)\.json|[0-9]{6,}\.(png|exr|npy)"
+    rf"|(frames/)?zarr\.(json|{_UNFINISHED})|frames/c/[0-9]+/[0-9]+/[0-9]+(\.{_UNFINISHED})?"
+)
 
 
 def _check_ours(place: Path, description: Path, single: bool) -> None:

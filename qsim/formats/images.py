@@ -66,7 +66,12 @@ def read_pictures(folder: Path) -> Iterator[Array]:
 
 
 def _pngs(folder: Path) -> list[Path]:
-    return numbered([file for file in folder.iterdir() if file.suffix.lower() == ".png"])
+    return _files(folder, ".png")
+
+
+def _files(folder: Path, *endings: str) -> list[Path]:
+    """Return the files of a folder with these endings, in any case, by their numbers."""
+    return numbered([file for file in folder.iterdir() if file.suffix.lower() in endings])
 
 
 def _check_complete(folder: Path, pictures: list[Path]) -> None:
@@ -86,7 +91,7 @@ def read_tiff(path: Path, hints: Hints) -> Recording:
 
     `ValueError` for other colours than grey and RGB, unless the pixels of a palette are codes (--bits).
     """
-    found = [path] if path.is_file() else numbered([*path.glob("*.tif"), *path.glob("*.tiff")])
+    found = [path] if path.is_file() else _files(path, ".tif", ".tiff")
     if not found:
         raise FileNotFoundError(f"{path}: holds no .tif or .tiff")
     counts = [_tiff_pages(file) for file in found]

@@ -25,7 +25,14 @@ def read_mat(path: Path, hints: Hints) -> Recording:
         if info.is_file():
             with decoding_errors(info, "JSON"):
                 wanted = int(json.loads(info.read_text("utf-8"))["no_parts"])
+            if len(files) > wanted:
+                raise ValueError(f"{path}: {len(files)} parts, and info.json states {wanted}; move the others away")
             files = [path / f"part_{k}.mat" for k in range(1, min(wanted, 100_000) + 1)]
+        elif [file.name for file in files] != [f"part_{k}.mat" for k in range(1, len(files) + 1)]:
+            there = ", ".join(file.name for file in files[:5])
+            raise ValueError(
+                f"{path}: its parts are not numbered 1, 2, ... without a gap: {there}; add what is missing"
+            )
         for file in files:
             if not file.is_file():
                 raise FileNotFoundError(f"{file}: missing, though info.json states {len(files)} parts")

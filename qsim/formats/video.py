@@ -166,5 +166,5 @@ def _video_shape(path: Path) -> tuple[int, int, int, int]:
         stream = container.streams.video[0]
         height, width = stream.codec_context.height, stream.codec_context.width
         full = _full(path, stream.codec_context.format)
-        frames = sum(1 for packet in container.demux(stream) if packet.size)
+        frames = sum(1 for packet in container.demux(stream) if packet.size and not packet.is_discard)  # cut off
     return frames, height, width, full

@@ -1,6 +1,7 @@
 """Tests layouts: recognised by name, signature and size, never guessed."""
 
 import gzip
+import json
 import re
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from qsim.clip.clip import Clip
 from qsim.colour import to_linear
 from qsim.formats import detection, exporting, images, importing, video
 from qsim.formats.exporting import Export
+from qsim.formats.recording import Hints
 
 
 def test_three_raw_layouts_of_one_size_are_not_guessed(tmp_path: Path):
@@ -192,3 +194,58 @@ def test_a_picture_beside_folders_of_pictures_is_not_taken_for_them(tmp_path: Pa
         images.write_png(place, iter(np.zeros((2, 8, 10), np.uint8)))
     with pytest.raises(ValueError, match=r"holds pictures and folders of pictures \(.*a\); move one of them away$"):
         detection.recordings(tmp_path, layout)
+
+
+def test_endings_of_tiff_are_read_in_any_case(tmp_path: Path):
+    """`.TIF` was refused, and left out beside `.tif`."""
+    tifffile = pytest.importorskip("tifffile")
+    pictures = np.random.default_rng(0).integers(0, 255, (3, 6, 8)).astype(np.uint8)
+    for name, picture in zip(("a_1.tif", "a_2.TIF", "a_3.TIFF"), pictures, strict=True):
+        tifffile.imwrite(tmp_path / name, picture)
+    np.testing.assert_array_equal(importing.read(tmp_path, Hints(transfer="linear")).shape, (3, 6, 8))
+
+
+def test_an_array_beside_a_picture_is_not_dropped(tmp_path: Path):
+    images.write_png(tmp_path, iter(np.zeros((1, 8, 10), np.uint8)))
+    np.save(tmp_path / "capture.npy", np.zeros((2, 8, 2), np.uint8))
+    with pytest.raises(ValueError, match=r"holds recordings of two kinds \(.*000000\.png, .*capture\.npy\)"):
+        detection.detect(tmp_path)
+
+
+def test_signed_codes_are_codes(tmp_path: Path):
+    """NumPy's default integers were taken for a picture, whose --transfer then refused --bits."""
+    codes = np.random.default_rng(0).integers(0, 8, (4, 8, 8))
+    np.save(tmp_path / "x.npy", codes)
+    np.testing.assert_array_equal(everything(tmp_path / "x.npy", bits=3), codes)
+    np.save(tmp_path / "b.npy", codes > 3)
+    with pytest.raises(ValueError, match="bool values are codes of one bit, not light"):
+        importing.read(tmp_path / "b.npy", Hints(layout="light", transfer="linear"))
+
+
+def test_missing_shards_and_parts_are_told(tmp_path: Path):
+    """Frames before and after them were joined."""
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    planes = np.random.default_rng(0).integers(0, 255, (4, 5, 2, 3)).astype(np.uint8)
+    description = {"w": 16, "h": 5, "frames": [{"file_path": str(i)} for i in range(8)]}
+    (scene / "transforms.json").write_text(json.dumps(description))
+    np.save(scene / "0000.npy", planes)
+    with pytest.raises(ValueError, match=r"3 colour planes; choose one with --channel 0"):
+        importing.read(scene)  # the file states no number of channels
+    with pytest.raises(ValueError, match=r"4 frames, and transforms\.json states 8; add the shards that are missing"):
+        importing.read(scene, Hints(channel=1))
+    np.save(scene / "0001.npy", planes)
+    assert importing.read(scene, Hints(channel=1)).shape == (8, 5, 16)
+    savemat = pytest.importorskip("scipy.io").savemat
+    for number in (1, 3):
+        savemat(tmp_path / f"part_{number}.mat", {"OUTPUT": np.ones((5, 6, 2))})
+    with pytest.raises(ValueError, match=r"not numbered 1, 2, \.\.\. without a gap: part_1\.mat, part_3\.mat"):
+        importing.read(tmp_path, Hints(layout="mat"))
+
+
+def test_a_cube_of_ours_keeps_its_orientation(tmp_path: Path):
+    np.save(tmp_path / "c.npy", np.zeros((3, 4, 2), np.uint8))
+    about = {"software": {"qsim": "0"}, "shape": [3, 4, 13], "orientation": "as stored"}
+    (tmp_path / "c.npy.json").write_text(json.dumps(about))
+    found = importing.read(tmp_path / "c.npy")
+    assert (found.shape, found.meta["orientation"]) == ((3, 4, 13), "as stored")

@@ -14,6 +14,7 @@ from PIL import Image
 from recordings import CAPTURE, SIZES, clip_of, everything
 
 from qsim.cli.program import main
+from qsim.clip.clip import Clip
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset
 from qsim.formats import exporting, importing
@@ -245,3 +246,26 @@ def test_nothing_is_written_into_a_clip(tmp_path: Path, capsys: pytest.CaptureFi
         assert f": lies in the clip {clip.path}, which holds nothing else; name another place" in told
     assert clip.streams == (stream.name,)
     assert main(["check", str(clip.path)]) == 0
+
+
+def test_a_killed_export_to_zarr_is_made_again(tmp_path: Path, monkeypatch):
+    """zarr deleted the mark of our exports, so that what a killed one left was taken for a foreign folder."""
+    pytest.importorskip("zarr")
+    clip = clip_of(tmp_path / "clip", np.random.default_rng(0).random((3, 6, 8)).astype(np.float32))
+    part = tmp_path / "out.zarr.part"
+    written = exporting._light_blocks
+
+    def killed(source: Clip):
+        yield from written(source)
+        for name in ("zarr", "frames/zarr"):  # as zarr names what it is writing
+            (part / f"{name}.{'0' * 32}.partial").write_bytes(b"")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(exporting, "_light_blocks", killed)
+        patch.setattr(exporting.shutil, "rmtree", lambda *_: None)  # a killed process removes nothing
+        with pytest.raises(KeyboardInterrupt):
+            exporting.export(clip, tmp_path / "out.zarr", Export("zarr"))
+    assert part.exists()
+    exporting.export(clip, tmp_path / "out.zarr", Export("zarr"))
+    assert not part.exists()
