@@ -160,7 +160,7 @@ def tiles_line(names: Iterable[str], size: str) -> list[str]:
     cut = ", ".join(f"{name} {tiles}" for name, tiles in cuts.items() if tiles > 1)
     bound = f"{default_memory('cpu') / 1e9:g} GB"
     text = f"The bound of {bound} cuts a frame into tiles, whose overlap is counted, too: {cut}."
-    return textwrap.wrap(text, 118) if cut else []
+    return textwrap.wrap(text, 118, break_on_hyphens=False) if cut else []
 
 
 def seconds(row: dict[str, Any]) -> float:
@@ -176,7 +176,7 @@ def cells(cost: dict[str, Any]) -> list[str]:
     taken, macs, psnr = cost["seconds_per_frame"], cost["gmac_per_frame"], cost["psnr_matched"]
     return [
         *(f"{taken:.3g}", f"{1 / taken:.3g}", f"{cost['peak_bytes'] / 1e6:.0f}"),
-        *("" if macs is None else f"{macs:.3g}", "" if psnr is None else f"{psnr:.2f}"),
+        *("" if macs is None else f"{float(f'{macs:.3g}'):g}", "" if psnr is None else f"{psnr:.2f}"),
     ]
 
 
