@@ -145,12 +145,18 @@ def memdeblur_loss(network: Any, batch: Batch, settings: Settings, share: float)
 
 
 def check_memdeblur(network: Any, settings: Settings) -> None:
-    """Raise `ValueError` for a batch of one small crop, of which batch normalisation sees one value per channel."""
-    if settings.batch == 1 and settings.crop <= 64 and not network.config.group_norm:
+    """Raise `ValueError` for few small crops, of which batch normalisation sees few values per channel.
+
+    With up to three windows of at most 64 px the gradient through eleven frames is 1e32 or not finite, at any rate.
+    """
+    if settings.batch < FEWEST and settings.crop <= 64 and not network.config.group_norm:
         raise ValueError(
-            f"--batch 1 with --crop {settings.crop}: batch normalisation of MemDeblur needs two windows or crops above "
-            "64 px; give --batch 2"
+            f"--batch {settings.batch} with --crop {settings.crop}: batch normalisation of MemDeblur needs {FEWEST} "
+            f"windows or crops above 64 px; give --batch {FEWEST}"
         )
+
+
+FEWEST = 4  # windows of small crops that MemDeblur's batch normalisation learns from
 
 
 # Student-Teacher
