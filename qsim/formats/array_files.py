@@ -65,7 +65,8 @@ def read_cube(path: Path, hints: Hints) -> Recording:
     def read(start: int, stop: int) -> Array:
         return np.unpackbits(np.asarray(array[start:stop]), axis=-1, count=width)
 
-    meta = {"bit_order": "msb"} | {key: known[key] for key in ("orientation",) if isinstance(known.get(key), str)}
+    stated = known.get("orientation")
+    meta = {"bit_order": "msb"} | ({"orientation": stated} if isinstance(stated, str) else {})
     return Recording((frames, height, width), read, "photon cube", 1, meta=meta)
 
 
