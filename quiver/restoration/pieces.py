@@ -130,7 +130,7 @@ def clip_bytes(network: Any) -> int:
     name = type(network).__name__
     first, more = CLIP_BYTES[name]
     share = network.config.width / type(network.config)().width
-    if name == "EMVD":  # its wide layers see a sixteenth of the pixels: 21 times the width took 2.2 times the memory
+    if name == "EMVD":  # its wide layers see a sixteenth of the pixels: 21 times the width takes twice the memory
         share = 0.95 + 0.052 * share
     of_frame = more * max(share, 1) if name == "Bit2Bit" else more  # its layers hold all frames of a part
     return 500 + int(1.5 * (share * first + of_frame * part.seen))

@@ -237,7 +237,7 @@ def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, 
         return 0, 0.0, ""
     try:
         found = read_json(journal)
-        for key in ("threads", "device", "look_ahead", "source_sha256"):  # numbers agree to rounding on any device
+        for key in ("threads", "device", "look_ahead", "source_sha256"):  # on any device numbers agree to rounding
             found.pop(key, None)
         done, seconds = int(found.pop("done", 0)), float(found.pop("seconds", 0.0))
         for key in ("sha256", "checksum"):

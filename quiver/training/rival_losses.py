@@ -144,19 +144,19 @@ def memdeblur_loss(network: Any, batch: Batch, settings: Settings, share: float)
     return total
 
 
+FEWEST = 4  # windows of small crops that MemDeblur's batch normalisation learns from
+
+
 def check_memdeblur(network: Any, settings: Settings) -> None:
     """Raise `ValueError` for few small crops, of which batch normalisation sees few values per channel.
 
-    With up to three windows of at most 64 px the gradient through eleven frames is 1e32 or not finite, at any rate.
+    With two of 32 to 64 px, or three of 32 px, the first gradient was not finite; with four it was.
     """
     if settings.batch < FEWEST and settings.crop <= 64 and not network.config.group_norm:
         raise ValueError(
             f"--batch {settings.batch} with --crop {settings.crop}: batch normalisation of MemDeblur needs {FEWEST} "
             f"windows or crops above 64 px; give --batch {FEWEST}"
         )
-
-
-FEWEST = 4  # windows of small crops that MemDeblur's batch normalisation learns from
 
 
 # Student-Teacher
