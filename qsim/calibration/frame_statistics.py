@@ -1,6 +1,6 @@
 """Measures the statistics of a stack of frames, block by block in constant memory.
 
-    codes [t, H, W], block after block  ->  histogram, per-pixel sums of x, x^2 and x_t x_(t+1)
+    codes [t, H, W], block after block  ->  histogram, per-pixel sums of x, x^2 and x_t x_(t+1), and over neighbours
 
 A million frames need as much memory as one. Codes are integers; float arrays are accepted if every value is integer.
 """
@@ -29,6 +29,7 @@ class FrameStatistics:
     last: Array
     dispersion: float = float("nan")  # of sums of planes: variance in time over that of a binomial; 1 is expected
     sums: int = 0  # frames of sums that the planes came in
+    adjacent: Array | None = None  # float64 [2, H, W], sum of code x code of the pixel below, and of that to the right
 
     @property
     def pixels(self) -> int:
@@ -108,6 +109,7 @@ def measure(
         values = codes.astype(np.float64)
         if sums is None:
             sums = {key: np.zeros(values.shape[1:]) for key in ("total", "square", "lagged")}
+            adjacent = np.zeros((2, *values.shape[1:]))
             first = previous = values[0]
         elif values.shape[1:] != previous.shape:
             raise ValueError(f"{name}: frame {frames} is {values.shape[1:]}, the frames before are {previous.shape}")
@@ -116,12 +118,16 @@ def measure(
         sums["total"] += values.sum(axis=0)
         sums["square"] += np.einsum("tyx,tyx->yx", values, values)
         sums["lagged"] += np.einsum("tyx,tyx->yx", values[1:], values[:-1])
+        adjacent[0, :-1] += np.einsum("tyx,tyx->yx", values[:, 1:], values[:, :-1])
+        adjacent[1, :, :-1] += np.einsum("tyx,tyx->yx", values[:, :, 1:], values[:, :, :-1])
         previous = values[-1]
         frames += len(values)
     if sums is None:
         raise ValueError(f"{name}: has no frames")
     total, square, lagged = sums["total"], sums["square"], sums["lagged"]
-    return FrameStatistics(frames, float(exposure), photons, histogram, total, square, lagged, first, previous)
+    return FrameStatistics(
+        frames, float(exposure), photons, histogram, total, square, lagged, first, previous, adjacent=adjacent
+    )
 
 
 def measure_sums(

@@ -75,3 +75,15 @@ def test_stacks_of_other_bits_are_refused():
     for calibrate, bits in ((calibrate_spad, 1), (calibrate_qis, 10)):
         with pytest.raises(ValueError, match=f"bits={bits}, and a stack was measured with bits=8; give both the same"):
             calibrate(stacks[:1], stacks[1:], bits=bits)
+
+
+def test_products_of_neighbours_are_summed_over_frames():
+    """In blocks of any length."""
+    codes = np.random.default_rng(4).integers(0, 8, (9, 5, 6))
+    found = measure([codes[:2], codes[2:]], bits=3, exposure=1e-3, photons=0.0)
+    below = (codes[:, 1:] * codes[:, :-1]).sum(axis=0)
+    right = (codes[:, :, 1:] * codes[:, :, :-1]).sum(axis=0)
+    assert np.array_equal(found.adjacent[0, :-1], below)
+    assert np.array_equal(found.adjacent[1, :, :-1], right)
+    assert not found.adjacent[0, -1].any()
+    assert not found.adjacent[1, :, -1].any()
