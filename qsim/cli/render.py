@@ -130,6 +130,9 @@ def _run_render(args: argparse.Namespace) -> int:
     findings = [Finding(**finding) for finding in render_meta["findings"]]
     if not args.explain and (args.reuse or render_meta["neighbours"]):
         text += "".join(f"\n{explain([one])}" for one in findings if one.effect == REUSE)
-    text += "\n" + (explain(findings) if args.explain or clip.camera is None else diffraction_line(clip.camera))
+    if args.explain or clip.camera is None:
+        text += "\n" + explain(findings)
+    else:
+        text += "\n" + diffraction_line(clip.camera, clip.bands)
     output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)
     return 0

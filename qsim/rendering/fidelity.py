@@ -29,6 +29,7 @@ from qsim.rendering.budget import Allowed, Budget, Finding, blur_error, grid_sam
 from qsim.rendering.pilot import COUNTS, Pilot, denoised_samples, rests
 from qsim.rendering.reuse.sharing import Need, Sharing, shared_samples
 from qsim.scene import Scene
+from qsim.scene.bands import Bands
 
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
 SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add
@@ -144,7 +145,7 @@ def choose_budget(
         about_samples = Finding("samples", f"{chosen.samples} per pixel{', denoised' if chosen.denoise else ''}", size)
         about_denoiser = Finding("denoiser", chosen.about_denoiser, "tried on shared samples")
     effects = (*flickering(pilot.renderer.strengths(frames), pilot.extent, instants), *_lens(scene.camera))
-    lens = (*effects, *effects_left_out(scene.camera, pilot.truths()))
+    lens = (*effects, *effects_left_out(scene.camera, pilot.truths(), scene.bands))
     pixels = scene.camera.height * scene.camera.width
     noisy = noise.at(chosen.samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
     about_light, about_motion = _light(dimmed, noisy, bool(chosen.denoise)), moving(pilot.extent, shutter)
@@ -336,7 +337,7 @@ def _lens(camera: Camera) -> tuple[Finding, ...]:
     return (Finding("lens", "exact rays", f"corner moved by {moved:+.3g} px, with {100 * share:.3g} % of the light"),)
 
 
-def effects_left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:
+def effects_left_out(camera: Camera, truths: list[dict[str, Array]], bands: Bands | None = None) -> tuple[Finding, ...]:
     """Return findings for effects that the renderer leaves out, with their size where it can be computed."""
     depths = np.concatenate([truth["depth"].ravel() for truth in truths])
     depths = np.where(np.isinf(depths), 1e9, depths)  # the surroundings
@@ -345,6 +346,6 @@ def effects_left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Fi
     how = "thin lens" if camera.aperture_blur else "left out, pinhole"
     return (
         Finding("depth of field", how, f"largest blur circle {blur:.2g} px at f/{camera.f_number:g}"),
-        Finding("diffraction", "left out here", diffraction_line(camera)),
+        Finding("diffraction", "left out here", diffraction_line(camera, bands)),
         Finding("lens aberrations, polarisation, spectra", "not modelled", "size unknown"),
     )

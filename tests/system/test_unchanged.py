@@ -8,6 +8,7 @@ with what commit 4923285 computed: near the ends of a clip they know that reflec
 compared there with commit 60770fb, since it merges the frames that exist near the ends, and its scores of complete
 clips with commit 1f4cf2f.
 Calibrations of counters are compared with commit 75e07fe, which takes the exposure of dark frames into account.
+The stream with diffraction is that of the blur by the lens alone: before, the pixel was integrated over twice.
 The numbers of `nano` went with that network, and the checksum of a clip's clip.json left the records of jobs: that file
 now tells neighbours, quality and another estimate of the error, while frames and streams stayed. Only names that
 survive every move are used: those of `import qsim`, `quiver.restore`, and the command lines.
