@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -41,43 +41,39 @@ def read_stack(
     bits: int,
     exposure: float,
     photons: float | None,
-    width: int | None = None,
+    hints: Hints = Hints(),  # noqa: B008 (frozen)
     planes: int | None = None,
-    variable: str | None = None,
 ) -> FrameStatistics:
     """Return the statistics of the frames in a file: `.npy` of integer values, a stream, or any recording of `convert`.
 
-    `exposure` in seconds, `photons` per pixel and exposure. With `width` an `.npy` is a photon cube of packed planes.
-    With `planes` every value sums this number of binary planes. `variable` names an array of a `.mat`. `ValueError` or
-    `FileNotFoundError` naming the file.
+    `exposure` in seconds, `photons` per pixel and exposure. `hints` state where the values lie (its `bits` do not
+    count); with a `width` and no `layout` an `.npy` is a photon cube of packed planes. With `planes` every value sums
+    this number of binary planes. `ValueError` or `FileNotFoundError` naming the file.
     """
     if planes is None:
-        blocks = _blocks(path, bits, exposure, None, width, variable)
+        blocks = _blocks(path, bits, exposure, None, hints)
         return measure(blocks, bits=bits, exposure=exposure, photons=photons, name=str(path))
-    blocks = _blocks(path, planes.bit_length(), exposure, planes, width, variable)
+    blocks = _blocks(path, planes.bit_length(), exposure, planes, hints)
     return measure_sums(blocks, planes=planes, exposure=exposure, photons=photons, name=str(path))
 
 
-def _blocks(
-    path: Path, bits: int, exposure: float, planes: int | None, width: int | None, variable: str | None
-) -> Iterator[Array]:
+def _blocks(path: Path, bits: int, exposure: float, planes: int | None, hints: Hints) -> Iterator[Array]:
     """Return the frames of a file in blocks [t, H, W]."""
-    if variable is not None and path.suffix != ".mat" and not path.is_dir():
-        raise ValueError(f"{path}: --variable names an array of a .mat file; leave it out")
     stream = stream_of(path)
-    if stream is not None and width not in (None, stream.shape[2]):
-        raise ValueError(f"{path}: is a stream of {stream.shape[2]} pixels per row, not {width}; leave --width out")
-    if stream is not None or (path.suffix == ".npy" and width is None):
-        return _array_blocks(read_counts(path, bits=bits, exposure=exposure * (planes or 1)))
-    if path.suffix == ".mat":
-        if width is not None:
-            raise ValueError(f"{path}: --width acts on packed planes, and a .mat has one value per pixel; leave it out")
-        return _array_blocks(mat_array(path, variable))
-    if path.suffix.lower() == ".npz" and width is None:
+    if stream is not None:
+        if hints.width not in (None, stream.shape[2]):
+            raise ValueError(
+                f"{path}: is a stream of {stream.shape[2]} pixels per row, not {hints.width}; leave --width out"
+            )
+        return _array_blocks(read_counts(path, replace(hints, width=None), bits, exposure * (planes or 1)))
+    bare = hints == Hints(variable=hints.variable)
+    if bare and path.suffix in (".npy", ".mat"):
+        return _array_blocks(read_counts(path, hints, bits, exposure * (planes or 1)))
+    if bare and path.suffix.lower() == ".npz":
         return _array_blocks(_photon_codes(path, bits, exposure, planes))
-    layout = "cube" if path.suffix == ".npy" else None  # --width states it: dark planes could be several layouts
-    hints = Hints(layout=layout, bits=min(bits, 16), width=width, variable=variable)
-    recording = importing.read(path, hints, compared=("bits",))
+    if path.suffix == ".npy" and hints.layout is None:  # dark planes could be several layouts
+        hints = replace(hints, layout="codes" if hints.width is None else "cube")
+    recording = importing.read(path, replace(hints, bits=min(bits, 16)), compared=("bits",))
     if recording.is_light or recording.bits != bits:
         raise ValueError(f"{path}: holds {recording.source}, not values of {bits} bits")
     return (block for _, block in importing.blocks(recording))
@@ -108,16 +104,20 @@ def _photon_codes(path: Path, bits: int, exposure: float, planes: int | None) ->
 
 
 def read_counts(
-    path: Path, variable: str | None = None, bits: int | None = None, exposure: float | None = None
+    path: Path,
+    hints: Hints = Hints(),  # noqa: B008 (frozen)
+    bits: int | None = None,
+    exposure: float | None = None,
 ) -> Array:
     """Return the frames [T, H, W] of an `.npy`, mapped, of a stream, read when they are used, or of a `.mat`.
 
-    `ValueError` or `FileNotFoundError` naming the file, also for a stream of other `bits`, or whose codes have another
-    `exposure` [s].
+    With `hints` other than the `variable` of a `.mat`, of any recording of `convert`, all in memory. `ValueError` or
+    `FileNotFoundError` naming the file, also for a stream of other `bits`, or whose codes have another `exposure` [s].
     """
-    if path.suffix == ".mat":
-        return mat_array(path, variable)
-    if variable is not None:
+    bare = hints == Hints(variable=hints.variable)
+    if path.suffix == ".mat" and bare:
+        return mat_array(path, hints.variable)
+    if hints.variable is not None and not path.is_dir():
         raise ValueError(f"{path}: --variable names an array of a .mat file; leave it out")
     stream = stream_of(path)
     if stream is not None:
@@ -128,7 +128,14 @@ def read_counts(
                 f"{path}: is a stream of codes of {stream.exposure:g} s, not of {exposure:g} s; give what it states, "
                 "or convert it again with the true --exposure"
             )
+        if not bare:
+            raise ValueError(f"{path}: is a stream, which states its layout; leave the options of raw files out")
         return cast(Array, stream.codes)
+    if not bare:
+        recording = importing.read(path, replace(hints, bits=bits), compared=("bits",))
+        if recording.is_light:
+            raise ValueError(f"{path}: holds {recording.source} of light, not counts")
+        return recording.read(0, recording.shape[0])
     array = load_array(path)
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or array.size == 0:

@@ -9,6 +9,7 @@ from typing import Any
 from qsim import checks
 from qsim.cli.console import command, output, refuse_existing
 from qsim.cli.options import checked
+from qsim.cli.reader_options import LAYOUT, add_reader_options, hints_of
 
 
 def add_calibrate(sub: Any) -> None:
@@ -41,13 +42,11 @@ def add_calibrate(sub: Any) -> None:
         help="spad: every value is the sum of this many binary planes, SECONDS and PHOTONS are those of one plane; "
         "1: values are single exposures",
     )
-    parser.add_argument("--variable", help="array of a .mat file (default: OUTPUT, or the only one)")
     parser.add_argument("--model", choices=("qis", "spad"), help="kind of sensor (default qis; spad with --planes)")
     parser.add_argument("--paralyzable", action="store_true", help="spad: every arrival restarts the dead time")
     parser.add_argument("--ignore-dead-time", action="store_true", help="spad: model the counts as Poisson")
-    parser.add_argument(
-        "--width", type=int, help=".npy files are photon cubes (packed planes) with rows of this many pixels"
-    )
+    reading = parser.add_argument_group("where the values of the files lie")
+    add_reader_options(reading, LAYOUT, width="pixels of a row of packed planes: .npy files are photon cubes")
     parser.add_argument("-o", "--output", type=Path, required=True, help=".toml to write; .json and .png beside it")
     parser.add_argument("--force", action="store_true", help="replace existing files")
 
@@ -118,9 +117,8 @@ def _calibration_kind(args: argparse.Namespace) -> tuple[str, int]:
          "with dark and flat frames"),
         ("--paralyzable", args.paralyzable, model == "spad", "it is for --model spad and --static"),
         ("--paralyzable", args.paralyzable and args.ignore_dead_time, False, "--ignore-dead-time takes no dead time"),
-        ("--width", args.width is not None and args.width < 1, False, "a row has at least 1 pixel"),
-        ("--width", args.width is not None and (sums or args.static is not None), False, "it is for packed binary "
-         "planes, which are read one by one"),
+        ("--width", args.width is not None and _packed(args) and (sums or args.static is not None), False, "it is for "
+         "packed binary planes, which are read one by one"),
     ):  # fmt: skip
         if given and not acts:
             raise ValueError(f"{option}: {why}; leave it out")
@@ -133,7 +131,7 @@ def _calibration_kind(args: argparse.Namespace) -> tuple[str, int]:
         for option, given in (("--ignore-dead-time", args.ignore_dead_time), ("--paralyzable", args.paralyzable)):
             if given:
                 raise ValueError(f"{option}: binary planes have no dead time in this model; leave it out")
-    if args.width is not None and bits > 1:
+    if args.width is not None and bits > 1 and _packed(args):
         raise ValueError(f"--width: it is for packed binary planes, and --bits is {bits}; leave it out")
     if model == "spad" and bits > COUNTS and args.planes is None and not args.static:
         raise ValueError(
@@ -141,6 +139,11 @@ def _calibration_kind(args: argparse.Namespace) -> tuple[str, int]:
             "--planes 1 if every value counts one exposure"
         )
     return model, bits
+
+
+def _packed(args: argparse.Namespace) -> bool:
+    """Return whether --width states the packed planes of .npy files, not the size of raw frames."""
+    return args.layout in (None, "cube")
 
 
 def _assumed(args: argparse.Namespace, model: str, bits: int) -> str:
@@ -159,7 +162,7 @@ def _static(args: argparse.Namespace, bits: int) -> Any:
     from qsim.calibration.sensor_file import read_counts
 
     path, exposure = Path(args.static[0]), _number(args.static[1])
-    counts = read_counts(path, args.variable, bits, exposure)
+    counts = read_counts(path, hints_of(args, LAYOUT), bits, exposure)
     return calibrate_static(counts, bits=bits, exposure=exposure, paralyzable=args.paralyzable, name=str(path))
 
 
@@ -185,7 +188,6 @@ def _stack(words: list[str], args: argparse.Namespace, bits: int, *, dark: bool)
         bits=bits,
         exposure=numbers[0],
         photons=photons,
-        width=args.width,
+        hints=hints_of(args, LAYOUT),
         planes=args.planes if args.planes != 1 else None,
-        variable=args.variable,
     )

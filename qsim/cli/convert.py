@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks, files
-from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, command, output, refuse_idle
-from qsim.cli.options import check_free, checked, count, nonnegative, positive
+from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, command, note, output, refuse_idle
+from qsim.cli.options import check_free, count, positive
+from qsim.cli.reader_options import LAYOUT, add_reader_options, hints_of
 from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
-from qsim.formats.recording import TRANSFERS, Hints
 
 PICTURES = ("mp4", "png", "nerfstudio")  # kinds that show light through a transfer curve
 _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs", ".dat": "spike", ".npz": "photons"}
@@ -39,23 +39,9 @@ def add_convert(sub: Any) -> None:
         "output", type=Path, help="clip folder, stream name, .npy, .mp4 or .zarr, or a folder with --to"
     )
     reading = parser.add_argument_group("what a foreign file may not state")
-    reading.add_argument("--layout", help=f"kind of the input: {', '.join(detection.LAYOUTS)}")
+    add_reader_options(reading, [*LAYOUT, "bits", "transfer", "stretched", "flip", "columns", "black", "keep_gaps"])
     reading.add_argument("--frame-rate", type=positive, help="frames per second of the capture (not of a video file)")
     reading.add_argument("--exposure", type=positive, help="seconds of light per frame (default: the full frame time)")
-    reading.add_argument("--transfer", help=f"how pictures code light: {', '.join(TRANSFERS)} (also for writing)")
-    reading.add_argument("--height", type=count, help="pixels")
-    reading.add_argument("--width", type=count, help="pixels per row, before packing")
-    reading.add_argument("--bits", type=checked(checks.bits), help="the input holds codes of this many bits")
-    reading.add_argument("--stretched", action="store_true", help="codes were stretched to 0..255")
-    reading.add_argument("--channel", type=nonnegative, help="channel of a colour cube to read: 0, 1 or 2")
-    reading.add_argument(
-        "--flip",
-        choices=("none", "lr", "ud", "both"),
-        default="none",
-        help="mirror the frames: left-right, up-down or both",
-    )
-    reading.add_argument("--columns", type=count, help="keep only the first columns (Vidar dumps: 400 of 416)")
-    reading.add_argument("--variable", help="array of a .mat file (default: OUTPUT, or the only one)")
     reading.add_argument(
         "--sensor", help="sensor that made the codes, by name or file (default: an ideal binary counter)"
     )
@@ -77,11 +63,7 @@ def add_convert(sub: Any) -> None:
     writing.add_argument(
         "--lossy", action="store_true", help="write mp4 with FFmpeg's default settings, which lose noise"
     )
-    parser.add_argument(
-        "--white", type=positive,
-        help="reading: pixel value at which the camera saturates, as in 4095 (default: the largest that whole numbers "
-        "hold); writing pictures: light that becomes full scale (default: the 99.9th percentile)",
-    )  # fmt: skip
+    add_reader_options(parser, ["white"])
     parser.add_argument("--force", action="store_true", help="replace an existing output")
 
 
@@ -99,8 +81,8 @@ def _is_stream(path: Path) -> bool:
     return path.suffix == ".json" and path.is_file() and "ppp_factor" in files.read_json(path)
 
 
-_READING = ("layout", "frame_rate", "exposure", "height", "width", "bits", "stretched", "channel", "columns",
-            "variable", "sensor", "ppp", "split")  # fmt: skip
+_READING = (*LAYOUT, "frame_rate", "exposure", "bits", "stretched", "columns", "black", "keep_gaps", "sensor", "ppp",
+            "split")  # fmt: skip
 
 
 def _refuse_what_cannot_act(args: argparse.Namespace, kind: str, light: bool) -> None:
@@ -168,9 +150,8 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
     restored = _restored(args.input)
     args.frame_rate = args.frame_rate or restored.get("frame_rate")
     args.exposure = args.exposure or restored.get("exposure")
-    transfer = args.transfer or ("linear" if restored else None)
-    hints = Hints(args.layout, args.height, args.width, args.bits, transfer, args.channel, args.flip, args.columns,
-                  args.stretched, args.variable, args.white)  # fmt: skip
+    args.transfer = args.transfer or ("linear" if restored else None)
+    hints = hints_of(args)
     found = detection.recordings(args.input, args.layout)
     if args.layout is None:
         detection.check_one_kind(args.input, found)
@@ -183,6 +164,8 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
     with bar("converting") as progress:
         for source, target in pairs or [(args.input, args.output)]:
             recording = importing.read(source, hints)
+            if recording.reading:
+                note(f"{source}: {recording.reading}")
             rate = args.frame_rate or recording.frame_rate
             if rate is None:
                 raise ValueError(f"{args.input}: files do not state the capture rate; add --frame-rate, as in 2000")

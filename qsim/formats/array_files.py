@@ -20,6 +20,7 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.checks import check_shape
 from qsim.colour import to_linear
+from qsim.file_order import numbered
 from qsim.files import decoding_errors, load_array
 from qsim.formats.recording import (
     Hints,
@@ -27,7 +28,6 @@ from qsim.formats.recording import (
     checked_codes,
     light_recording,
     need_transfer,
-    numbered,
     reached,
     white_of,
 )

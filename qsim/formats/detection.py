@@ -9,7 +9,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.files import load_array
-from qsim.formats import array_files, images, mat_files, photon_times, raw_cameras, video
+from qsim.formats import array_files, images, mat_files, photon_times, raw_cameras, raw_layout, video
 from qsim.formats.recording import Hints, Recording
 
 Reader = Callable[[Path, Hints], Recording]
@@ -28,6 +28,12 @@ LAYOUTS: dict[str, Reader] = {  # the names of --layout
     "mat": mat_files.read_mat,
     "spike": raw_cameras.read_spike,
     "photons": photon_times.read_photons,
+    "raw": raw_layout.read_raw,
+    "mono10p": raw_layout.read_mono10p,
+    "mono12p": raw_layout.read_mono12p,
+    "mono10packed": raw_layout.read_mono10packed,
+    "mono12packed": raw_layout.read_mono12packed,
+    "mraw": raw_layout.read_mraw,
 }
 _WHOLE = "none: whole bytes per pixel"
 # (bit order, orientation) of layouts whose readers do not state it, and the reason for it.
@@ -61,6 +67,7 @@ def detect(path: Path, hints: Hints | None = None) -> str:
         return _detect_folder(path)
     suffix = "".join(path.suffixes[-2:]) if path.suffix == ".gz" else path.suffix.lower()
     simple = {".png": "png", ".tif": "tiff", ".tiff": "tiff", ".mat": "mat", ".dat": "spike", ".npz": "photons"}
+    simple |= {".mraw": "mraw", ".cihx": "mraw", ".cih": "mraw"}
     if suffix in simple:
         return simple[suffix]
     if suffix in VIDEOS:
@@ -129,7 +136,7 @@ def _detect_folder(path: Path) -> str:
     if shown:
         return PICTURES[shown[0].suffix.lower()]
     if raw:
-        return _detect_raw(raw_cameras.raw_files(path)[0], many=True)
+        return _detect_raw(raw_layout.raw_files(path)[0], many=True)
     raise ValueError(f"{path}: a folder of unknown kind; name it with `qsim convert --layout`: {', '.join(LAYOUTS)}")
 
 

@@ -19,6 +19,7 @@ from qsim import files
 from qsim.checks import MAX_PIXELS, check_shape
 from qsim.clip import exr
 from qsim.colour import from_linear, luminance, to_linear
+from qsim.file_order import numbered
 from qsim.files import decoding_errors
 from qsim.formats.recording import (
     Hints,
@@ -26,7 +27,6 @@ from qsim.formats.recording import (
     checked_codes,
     light_recording,
     need_transfer,
-    numbered,
     reached,
     white_of,
 )

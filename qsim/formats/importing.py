@@ -50,7 +50,9 @@ def read(path: Path, hints: Hints | None = None, *, compared: tuple[str, ...] = 
     for field in fields(Hints):
         given = getattr(hints, field.name) != field.default
         if given and field.name not in asked:
-            raise ValueError(f"{path}: --{field.name} changes nothing for {recording.source}; leave it out")
+            raise ValueError(
+                f"{path}: --{field.name.replace('_', '-')} changes nothing for {recording.source}; leave it out"
+            )
     if layout in ASSUMED:
         recording = with_stated_layout(recording, *ASSUMED[layout])
     return reoriented(recording, hints)

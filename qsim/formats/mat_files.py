@@ -9,8 +9,9 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.checks import check_shape
+from qsim.file_order import numbered
 from qsim.files import decoding_errors
-from qsim.formats.recording import Hints, Recording, checked_codes, numbered
+from qsim.formats.recording import Hints, Recording, checked_codes
 
 
 def read_mat(path: Path, hints: Hints) -> Recording:

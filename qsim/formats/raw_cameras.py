@@ -16,6 +16,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import check_shape
+from qsim.formats.raw_layout import raw_files
 from qsim.formats.recording import Hints, Recording, check_size
 
 HALF, FULL = (256, 512), (512, 512)  # pixels of SwissSPAD2's half and full array
@@ -112,17 +113,6 @@ def roughness(planes: Array) -> float:
     steps = np.mean(np.diff(mean, axis=1) ** 2) + np.mean(np.diff(mean, axis=0) ** 2)
     floor = 4 * np.mean(mean * (1 - mean) / len(planes))
     return float(steps / floor) if floor > 0 else float("inf")
-
-
-def raw_files(path: Path) -> list[Path]:
-    """Return one file, or the .bin files of a folder tree in the order of their numbers."""
-    if path.is_file():
-        return [path]
-    found = list(path.rglob("*.bin"))
-    if not found:
-        raise FileNotFoundError(f"{path}: no such file, or a folder without .bin files")
-    numbers = {file: [int(n) for n in re.findall(r"\d+", str(file.relative_to(path)))] for file in found}
-    return sorted(found, key=lambda file: (numbers[file], str(file)))
 
 
 def _raw(

@@ -7,7 +7,6 @@ are compared with the size of the file before memory is allocated. Errors and wa
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,9 +15,22 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.colour import TRANSFERS
+from qsim.colour import TRANSFERS, to_linear
 
 Marked = Callable[[int, int], tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class Times:
+    """When each frame was taken, as its source states it."""
+
+    values: tuple[float, ...]  # rising
+    unit: str  # s, or frames for numbers
+    source: str  # what states them, in words
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the table `times` of clip.json and of streams."""
+        return {"unit": self.unit, "source": self.source, "values": list(self.values)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +48,8 @@ class Recording:
     white_assumed: bool = False  # it is the largest value that the pixels can hold
     frame_rate: float | None = None  # Hz, if the file states it
     exposure: float | None = None  # s, if the file states it
+    reading: str = ""  # how the bytes or axes were read, in words; empty: only one way is known
+    times: Times | None = None  # of the frames, if the file states them
 
     @property
     def is_light(self) -> bool:
@@ -56,6 +70,15 @@ class Hints:
     columns: int | None = None  # keep only the first columns (raw Vidar dumps have 416, of which 400 are pixels)
     stretched: bool = False  # codes were stretched to 0 ... 255
     variable: str | None = None  # the array of a .mat file, where it holds several
+    dataset: str | None = None  # the path of an array in an HDF5 file
+    axes: str | None = None  # names of the axes of an array or TIFF, as in TCYX
+    slice: int | None = None  # of an axis Z
+    order: str | None = None  # raw pixels packed to bits: msb or lsb is the first of a byte
+    endian: str | None = None  # raw pixels of whole bytes: little or big
+    skip_bytes: int | None = None  # before the first raw frame
+    row_padding: int | None = None  # bytes after each raw row, which begins at a byte; None: rows follow bit by bit
+    black: float | None = None  # of light: pixel value without light; None: 0
+    keep_gaps: bool = False  # frames that the recording states as lost are stored as missing
     white: float | None = None  # of light: pixel value at which the camera saturates; None: full scale of whole numbers
 
 
@@ -70,26 +93,6 @@ def check_size(path: Path, size: int, frame_bytes: int, what: str, footer: tuple
     return frames
 
 
-def numbered(paths: list[Path]) -> list[Path]:
-    """Return files in the order of the numbers in their names; a text sort puts 10 before 2.
-
-    All numbers count, as in 0.999 before 1.000, but the last one alone where it is a counter: each file has its own,
-    and either none is left out or the names differ in more than numbers (3fa_1, 0c7_2). Hidden files are left out:
-    some systems put one beside each file.
-    """
-    shown = [path for path in paths if not path.name.startswith(".")]
-    last = {path: int((re.findall(r"\d+", path.stem) or ["-1"])[-1]) for path in shown}
-    texts, values = {re.sub(r"\d+", "0", path.stem) for path in shown}, set(last.values())
-    whole = max(values, default=0) - min(values, default=0) < len(shown)
-    counter = len(values) == len(shown) and (whole or len(texts) > 1)
-
-    def key(path: Path) -> tuple[str, list[Any], str]:
-        parts = [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", path.stem))]
-        return str(path.parent), [last[path]] if counter else parts, path.name
-
-    return sorted(shown, key=key)
-
-
 def light_recording(
     path: Path,
     shape: tuple[int, int, int],
@@ -102,6 +105,29 @@ def light_recording(
     """Return a recording of light; `full` is the largest value of the file's pixels, infinite for floats."""
     white, assumed = white_of(path, hints, full)
     return Recording(shape, lambda a, b: marked(a, b)[0], source, None, "", meta, marked, white, assumed)
+
+
+def values_recording(
+    path: Path,
+    shape: tuple[int, int, int],
+    raw: Callable[[int, int], Array],
+    bits: int,
+    source: str,
+    meta: dict[str, Any],
+    hints: Hints,
+) -> Recording:
+    """Return whole numbers 0 ... 2^bits - 1 [t, H, W] as codes, or with a transfer curve or a white as light."""
+    if hints.transfer is None and hints.white is None:
+        return Recording(shape, lambda a, b: checked_codes(path, raw(a, b), bits, a), source, bits, meta=meta)
+    transfer = need_transfer(path, hints)
+    full = float(2**bits - 1)
+    white, _ = white_of(path, hints, full)
+
+    def marked(start: int, stop: int) -> tuple[Array, Array]:
+        values = checked_codes(path, raw(start, stop), bits, start)
+        return to_linear(values, transfer, full), reached(values, white)
+
+    return light_recording(path, shape, marked, source, meta | {"transfer": transfer}, hints, full)
 
 
 def white_of(path: Path, hints: Hints, full: float) -> tuple[float | None, bool]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import MAX_PIXELS
+from qsim.file_order import natural
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
 from qsim.scene.motion import Keyframes
@@ -169,14 +169,8 @@ def _in_order(frames: list[dict[str, Any]], where: str) -> list[dict[str, Any]]:
         for i, frame in enumerate(frames)
     ]
     if all(frame.get("file_path") is not None for frame in found):
-        found.sort(key=lambda frame: _counted(str(frame["file_path"])))
+        found.sort(key=lambda frame: natural(str(frame["file_path"])))
     return found
-
-
-def _counted(name: str) -> list[tuple[int, str]]:
-    """Return a key that sorts names by their numbers: frame_2 before frame_10."""
-    parts = re.split("([0-9]+)", name)
-    return [(len(part.lstrip("0")), part.lstrip("0")) if i % 2 else (0, part) for i, part in enumerate(parts)]
 
 
 def _pose(frame: dict[str, Any], scale: float) -> Array:

@@ -8,6 +8,7 @@ from synthetic import SPADCase, statistics_of
 from qsim.calibration.sensor_file import read_counts, read_stack, sensor_of, to_toml, write
 from qsim.calibration.spad import calibrate_spad
 from qsim.formats import photon_times
+from qsim.formats.recording import Hints
 from qsim.sensor import devices
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
@@ -33,7 +34,7 @@ def test_frames_are_read_from_npy_and_from_a_photon_cube(tmp_path):
     np.save(tmp_path / "codes.npy", planes)
     np.save(tmp_path / "cube.npy", np.packbits(planes, axis=-1))
     one = read_stack(tmp_path / "codes.npy", bits=1, exposure=1e-5, photons=None)
-    two = read_stack(tmp_path / "cube.npy", bits=1, exposure=1e-5, photons=None, width=11)
+    two = read_stack(tmp_path / "cube.npy", bits=1, exposure=1e-5, photons=None, hints=Hints(width=11))
     assert np.array_equal(one.total, planes.sum(axis=0))
     assert np.array_equal(one.total, two.total)
     with pytest.raises(FileNotFoundError, match=r"nothing\.npy"):
@@ -63,10 +64,10 @@ def test_planes_of_a_stream_need_no_width(tmp_path):
     one = clip.sense(BinarySPAD(0.5, 200.0), ppp=0.7, name="one")
     sums = clip.sense(BinarySPAD(0.5, 200.0, 2), ppp=2.1, group=True, name="sums")
     for width in (None, 11):
-        found = read_stack(one.path, bits=1, exposure=5e-4, photons=None, width=width)
+        found = read_stack(one.path, bits=1, exposure=5e-4, photons=None, hints=Hints(width=width))
         assert np.array_equal(found.total, one.codes().sum(axis=0, dtype=float))
     with pytest.raises(ValueError, match="is a stream of 11 pixels per row, not 12; leave --width out"):
-        read_stack(one.path, bits=1, exposure=5e-4, photons=None, width=12)
+        read_stack(one.path, bits=1, exposure=5e-4, photons=None, hints=Hints(width=12))
     found = read_stack(sums.path, bits=1, exposure=5e-4, photons=None, planes=3)
     assert (found.frames, found.mean) == (9, pytest.approx(sums.codes().mean() / 3))
 
@@ -90,7 +91,7 @@ def test_photon_times_are_calibrated_as_the_counts_of_their_pixels(tmp_path):
         (1e-3, {"bits": 8}, "an exposure of 0.001 s; the photon times state 0.0005 s, give that"),
         (5e-4, {"bits": 1, "planes": 50}, "an exposure of 0.0005 s; the photon times state 1e-05 s, give that"),
         (5e-4 / 300, {"bits": 1, "planes": 300}, "of photon times sums of at most 255 are made"),
-        (5e-4, {"bits": 1, "width": 7}, "--width changes nothing for photon times; leave it out"),
+        (5e-4, {"bits": 1, "hints": Hints(width=7)}, "--width changes nothing for photon times; leave it out"),
     ):
         with pytest.raises(ValueError, match=message):
             read_stack(path, exposure=seconds, photons=None, **more)

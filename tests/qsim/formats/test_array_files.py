@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from recordings import CAPTURE, SIZES, everything, one, random_planes
 
+from qsim.file_order import numbered
 from qsim.formats import array_files, exporting, importing
 from qsim.formats.exporting import Export
-from qsim.formats.recording import Hints, numbered
+from qsim.formats.recording import Hints
 
 
 def test_golden_photon_cube(tmp_path: Path):

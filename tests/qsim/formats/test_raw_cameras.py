@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import everything, one, random_planes
 
-from qsim.formats import importing, raw_cameras
+from qsim.formats import importing, raw_cameras, raw_layout
 from qsim.formats.recording import Hints
 
 
@@ -125,7 +125,7 @@ def test_files_of_equal_numbers_have_one_order(tmp_path: Path, monkeypatch: pyte
     """It was the order of the file system."""
     found = [tmp_path / folder / "acq_0.bin" for folder in "ba"]
     monkeypatch.setattr(Path, "rglob", lambda self, pattern: iter(found))
-    assert raw_cameras.raw_files(tmp_path) == found[::-1]
+    assert raw_layout.raw_files(tmp_path) == found[::-1]
 
 
 @pytest.mark.parametrize("full", [False, True])

@@ -11,9 +11,10 @@ import raw_planes
 from recordings import CAPTURE, everything, random_planes
 
 from qsim.clip.sensing import Sensing, sense
+from qsim.file_order import numbered
 from qsim.formats import array_files, detection, exporting, images, importing, photon_times, video
 from qsim.formats.exporting import Export
-from qsim.formats.recording import Hints, Recording, numbered
+from qsim.formats.recording import Hints, Recording
 
 
 def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):
@@ -44,6 +45,12 @@ def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):
         [f"cam2_{n}" for n in range(8, 12)],
         ["3fa9c1_1", "77bc_2", "0c7d1_4", "e5_11"],
         [f"img_{400 if n % 2 else 100}us_{n}" for n in range(1, 13)],
+        # decimals are numbers, of any length; whole numbers after an equal one (VFX) still count
+        ["RAW_0.125", "RAW_0.25", "RAW_0.5", "RAW_1.0"],
+        [f"{n / 10:g}.0" if n == 10 else f"{n / 10:g}" for n in range(1, 13)],
+        ["1726830927.5", "1726830927.75", "1726830928.125", "1726830928.2", "1726830928.25"],
+        [f"shot1.{n}" for n in range(8, 12)],
+        [f"{0.0625 * n:g}s" for n in range(1, 12)],
     ],
     ids=lambda names: names[0],
 )
@@ -96,10 +103,18 @@ def sample(folder: Path, layout: str) -> tuple[Path, Hints]:
         first, kind = np.arange(257), np.ones(256, np.uint8)  # one photon for each pixel
         text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         np.savez(path, times=np.linspace(0, 1.9e-3, 256), kind=kind, first=first, meta=text)
+    elif layout == "mraw":
+        path = folder / "a.mraw"
+        path.write_bytes(bytes(2 * 16 * 16))
+        names = ("Record Rate(fps) : 1000", "Shutter Speed(s) : 1/1000", "Total Frame : 2", "Image Width : 16")
+        names += ("Image Height : 16", "Color Bit : 8", "EffectiveBit Depth : 8", "EffectiveBit Side : Lower")
+        (folder / "a.cih").write_text("\n".join((*names, "File Format : MRaw")))
     else:
         path = folder / "a.bin"
-        path.write_bytes(bytes(64 if layout == "spike" else 32768))
-    needed: dict[str, Any] = {"spike": {"height": 16, "width": 16}, "cube": {"width": 16}, "visionsim": {}}
+        path.write_bytes(bytes({"spike": 64, "mono10p": 640}.get(layout, 768 if layout.startswith("mono") else 32768)))
+    size = {"height": 16, "width": 16}
+    needed: dict[str, Any] = {"spike": size, "cube": {"width": 16}, "visionsim": {}, "raw": size | {"bits": 8}}
+    needed |= dict.fromkeys(("mono10p", "mono12p", "mono10packed", "mono12packed"), size)
     light = layout in ("light", "video")  # the pictures hold one bit
     return path, Hints(layout, **({"transfer": "linear"} if light else needed.get(layout, {})))
 

@@ -227,3 +227,16 @@ def test_an_angle_without_a_size_is_that_of_the_rendered_picture(tmp_path: Path,
     assert same.focal_pixels == pytest.approx(found.focal_pixels)
     with pytest.raises(ValueError, match="fl_x is in pixels, and w and h are missing"):
         along_path(scene, written(tmp_path / "d.json", w=None, h=None), 2000.0, size)
+
+
+def test_decimals_in_the_names_of_pictures_are_numbers(tmp_path):
+    """Poses at 27.0, 27.05, 27.1 ... came as 0, 2, 4, 6, 8, 1, 3, 5, 7."""
+    path = written(tmp_path / "transforms.json")
+    content = json.loads(path.read_text())
+    frame = content["frames"][0]
+    content["frames"] = [copy.deepcopy(frame) | {"file_path": f"images/{27 + 0.05 * t:g}.png"} for t in range(9)]
+    for t, each in enumerate(content["frames"]):
+        each["transform_matrix"][0][3] = float(t)
+    path.write_text(json.dumps(content | {"frames": content["frames"][::-1]}))
+    read = read_camera_path(path)
+    np.testing.assert_allclose([read.pose(t / 10)[0, 3] for t in range(9)], range(9), atol=1e-9)
