@@ -170,7 +170,8 @@ class Run:
         }
         buffer = io.BytesIO()  # a full disk then raises the system's error, not torch's
         torch.save(content, buffer)
-        write_bytes(path, buffer.getbuffer())
+        with buffer.getbuffer() as stored:  # released if writing fails, too: a lent buffer cannot be freed
+            write_bytes(path, stored)
 
     def load(self, model: nn.Module, optimiser: Optimiser) -> State:
         """Load the newest state into model and optimiser; a new state if there is none, ValueError if it is damaged."""
