@@ -1,10 +1,10 @@
 """Chooses the Mitsuba variant: tests CUDA, then every LLVM, in a child process.
 
-    CUDA with OptiX -> LLVM 16 or newer -> scalar (slow, always available)
+    CUDA with OptiX -> LLVM (qsim/llvm.py) -> scalar (slow, always available)
 
-Dr.Jit 1.5 refuses LLVM 14 with an ImportError. With LLVM 15 the first render aborts the process. So no library is
-loaded before a child process has rendered with it. Results that last are stored in the user's cache folder; their key
-is the library's path and time, or the driver and CUDA_VISIBLE_DEVICES, and the versions of Mitsuba and Dr.Jit.
+Dr.Jit aborts the process at the first render with some libraries. So none is loaded before a child process has
+rendered with it. Results that last are stored in the user's cache folder; their key is the library's path and time, or
+the driver and CUDA_VISIBLE_DEVICES, and the versions of Mitsuba and Dr.Jit.
 
 Environment: DRJIT_LIBLLVM_PATH names an LLVM to try first; QSIM_ENGINE=cuda|llvm|scalar requires one engine.
 """
@@ -12,7 +12,6 @@ Environment: DRJIT_LIBLLVM_PATH names an LLVM to try first; QSIM_ENGINE=cuda|llv
 from __future__ import annotations
 
 import ctypes.util
-import glob
 import json
 import os
 import re
@@ -25,23 +24,27 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from qsim import llvm
 from qsim.files import write_bytes
 
-LLVM_VERSIONS = (22, 21, 20, 19, 18, 17, 16)  # newest first
 BACKENDS = ("cuda", "llvm", "scalar")
 VARIANTS = {"cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono", "scalar": "scalar_rgb"}
 PROBE_SECONDS = 180
-NO_FRAME, OPTIX = "no frame after", "OptiX is missing or too old"  # of failures that pass, and that stay
-INSTALL_HINT = "install LLVM 16 or newer (Debian, Ubuntu: apt install libllvm19) or set DRJIT_LIBLLVM_PATH to one"
+NO_FRAME = "no frame after"  # of a failure that may pass
+NO_LIBRARY = "cannot open shared object file"  # as well: a library that an LLVM needs can be installed beside it
+OPTIX = "OptiX is missing or too old"  # of a failure that stays
+INSTALL_HINT = llvm.install_hint()
 
 # Runs in a child process: one 4x4 frame of a lit sphere whose mean must be a positive number.
 _PROBE = """
 import ctypes, os, sys
-variant, library = sys.argv[1], sys.argv[2]
+variant, library, oldest, *companions = sys.argv[1:]
+for companion in companions:
+    ctypes.CDLL(companion)
 if library:
     loaded = ctypes.CDLL(library)
     if not hasattr(loaded, "LLVMGetVersion"):
-        sys.exit("older than LLVM 16, which Dr.Jit cannot use safely")
+        sys.exit(f"older than LLVM {oldest}, which Dr.Jit cannot use safely")
     number = ctypes.c_uint()
     loaded.LLVMGetVersion(ctypes.byref(number), None, None)
     print("version", number.value)
@@ -123,15 +126,16 @@ def decide(wanted: str | None) -> RenderEngine:
             return RenderEngine(VARIANTS["cuda"], "cuda", None, probe.detail)
         failures.append(f"CUDA: {probe.detail}")
     if wanted in (None, "llvm"):
-        for library in llvm_candidates():
-            probe = cached_probe(VARIANTS["llvm"], library)
+        libraries = llvm.candidates()
+        for path, origin in libraries:
+            probe = cached_probe(VARIANTS["llvm"], path)
             if probe.works:
-                return RenderEngine(VARIANTS["llvm"], "llvm", library, f"{probe.detail}, {library}")
-            failures.append(f"{library}: {probe.detail}")
-            if library == os.environ.get("DRJIT_LIBLLVM_PATH"):
-                warnings.warn(f"DRJIT_LIBLLVM_PATH={failures[-1]}; looking further", RuntimeWarning, stacklevel=3)
-        if not llvm_candidates():
-            failures.append("no libLLVM of version 16 to 22 found")
+                return RenderEngine(VARIANTS["llvm"], "llvm", path, f"{probe.detail} {origin}, {path}")
+            failures.append(f"{path}: {probe.detail}")
+            if path == os.environ.get(llvm.VARIABLE):
+                warnings.warn(f"{llvm.VARIABLE}={failures[-1]}; looking further", RuntimeWarning, stacklevel=3)
+        if not libraries:
+            failures.append(f"no libLLVM of version {llvm.OLDEST} or newer found")
     if wanted == "scalar":
         return RenderEngine(VARIANTS["scalar"], "scalar", None, "asked for")
     why = "; ".join(failures)
@@ -143,31 +147,6 @@ def decide(wanted: str | None) -> RenderEngine:
 
 
 decided = lru_cache(decide)
-
-
-def llvm_candidates() -> list[str]:
-    """Return the paths of LLVM libraries to test: DRJIT_LIBLLVM_PATH first, then the newest; each file once."""
-    named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    found = [named] if named else []
-    for number in LLVM_VERSIONS:
-        for pattern in llvm_patterns(number):
-            found += sorted(glob.glob(pattern))
-        listed = ctypes.util.find_library(f"LLVM-{number}")
-        if listed and os.path.isabs(listed):
-            found.append(listed)
-    unique: dict[str, str] = {}
-    for path in found:
-        if os.path.isfile(path):
-            unique.setdefault(os.path.realpath(path), path)
-    return list(unique.values())
-
-
-def llvm_patterns(number: int) -> list[str]:
-    folders = ["/usr/lib/*-linux-gnu", f"/usr/lib/llvm-{number}/lib", f"/usr/lib/llvm{number}/lib*", "/usr/lib64"]
-    folders += ["/usr/lib", "/usr/local/lib", f"{sys.prefix}/lib", os.environ.get("CONDA_PREFIX", sys.prefix) + "/lib"]
-    names = [f"libLLVM.so.{number}.*", f"libLLVM-{number}.so*", f"libLLVM.{number}*.dylib"]
-    brew = [f"{root}/opt/llvm@{number}/lib/libLLVM.dylib" for root in ("/opt/homebrew", "/usr/local")]
-    return [f"{folder}/{name}" for folder in dict.fromkeys(folders) for name in names] + brew
 
 
 def probe_cuda() -> Probe:
@@ -200,14 +179,14 @@ def lasts(probe: Probe) -> bool:
 
     A GPU without OptiX stays without it until its driver changes.
     """
-    return probe.works or not (
-        probe.detail.startswith(NO_FRAME) or (on_gpu(probe.backend) and OPTIX not in probe.detail)
-    )
+    passes = probe.detail.startswith(NO_FRAME) or NO_LIBRARY in probe.detail
+    return probe.works or not (passes or (on_gpu(probe.backend) and OPTIX not in probe.detail))
 
 
 def run_probe(variant: str, library: str | None) -> Probe:
     backend = variant.split("_")[0]
-    command = [sys.executable, "-W", "ignore", "-c", _PROBE, variant, library or ""]
+    needed = llvm.companions(library) if library else []
+    command = [sys.executable, "-W", "ignore", "-c", _PROBE, variant, library or "", str(llvm.OLDEST), *needed]
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False)
     except subprocess.TimeoutExpired:
@@ -216,7 +195,8 @@ def run_probe(variant: str, library: str | None) -> Probe:
     if child.returncode == 0 and child.stdout.rstrip().endswith("rendered"):
         return Probe(backend, library, True, f"LLVM {numbers.group(1)}" if numbers else "CUDA with OptiX")
     lines = [line.strip() for line in (child.stderr + "\n" + child.stdout).splitlines() if line.strip()]
-    last = next((line for line in lines if "ERROR" in line.upper()), lines[-1] if lines else "no message")
+    errors = [line for line in lines if "ERROR" in line.upper()]  # the last: start-up files of Python may print others
+    last = (errors or lines or ["no message"])[-1]
     ended = f"child process crashed with signal {-child.returncode}: " if child.returncode < 0 else ""
     if backend == "cuda" and "memory" not in last.lower() and any("optix" in line.lower() for line in lines):
         last = f"{OPTIX} ({last}); update the NVIDIA driver"

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import gc
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
+from qsim import llvm
 from qsim.backend import INSTALL_HINT, RenderEngine, choose, limit_threads
 
 
@@ -32,7 +32,7 @@ def in_colour(engine: RenderEngine) -> RenderEngine:
 def activate(engine: RenderEngine) -> None:
     """Make this engine's variant the current one; cheap if it is already active."""
     if engine.llvm_path:
-        os.environ["DRJIT_LIBLLVM_PATH"] = engine.llvm_path
+        llvm.prepare(engine.llvm_path)
     import mitsuba as mi
 
     if mi.variant() != engine.variant:

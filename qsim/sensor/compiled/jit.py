@@ -13,6 +13,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import backend as engine
+from qsim import llvm
 from qsim.keys import KEY_STEPS, MULTIPLIERS, ROUNDS
 
 _PACKET = 16  # numbers that a kernel works on at a time, at most
@@ -36,7 +37,7 @@ def backend() -> Any:
     if chosen.backend == "scalar":
         return None
     if chosen.llvm_path:
-        os.environ["DRJIT_LIBLLVM_PATH"] = chosen.llvm_path
+        llvm.prepare(chosen.llvm_path)
     import drjit as dr
 
     engine.limit_threads()
