@@ -26,7 +26,9 @@ from qsim.checks import suggest
 from qsim.cli.options import refuse_empty
 from qsim.files import FULL, Progress, wording
 from qsim.process import peak_memory
+from qsim.terminal import tolerant_output
 
+SHOWN_AFTER = 2.0  # s, before a progress bar appears
 PILOT = "pilot and compilation of kernels"  # before the first frame of a renderer
 RESUMES = "the same command resumes where it stopped"
 STARTS_AGAIN = "no incomplete file is left; run the same command again"
@@ -201,7 +203,22 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
     """Parse and run a command; return its exit code. Wrong input becomes one line on stderr and 2, Ctrl-C 130.
 
     With --json a failure is also an object on stdout: {"error": its line, "exit_code": 2}. Without words, print help.
+    Streams that cannot be written do not end the work. A result that is lost on stdout changes exit code 0 to 1, but
+    not if its reader has ended, as in `| head`.
     """
+    with tolerant_output() as (out, _):
+        code = _run(parser, argv)
+        out.flush()
+        lost = out.failure
+        if code == 0 and lost is not None and not isinstance(lost, BrokenPipeError):
+            return failed(
+                f"{parser.prog}: standard output: {wording(lost)}; the work is done, its report is lost", 1, False
+            )
+        return code
+
+
+def _run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
+    """Parse and run a command as `run`; print on `sys.stdout` and `sys.stderr`."""
     given = list(sys.argv[1:] if argv is None else argv)
     if not given:
         parser.print_help()
@@ -218,9 +235,6 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
         with _warnings_as_lines(parser.prog):
             return int(args.run(args))
     except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
-        if isinstance(error, BrokenPipeError):  # the reader of the output has ended, as in `| head`
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
         if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in _PACKAGES:
             raise
         if os.environ.get("QSIM_DEBUG") or args.verbose:
@@ -314,22 +328,21 @@ def refuse_existing(path: Path, force: bool) -> None:
 
 @contextlib.contextmanager
 def bar(label: str, unit: str = "frame", first: str = "") -> Iterator[Progress]:
-    """Show a progress bar on stderr after two seconds; the block calls it with (done, total).
+    """Show a progress bar on stderr after `SHOWN_AFTER`; the block calls it with (done, total).
 
-    `first` names the work before the first unit is done; it is shown after two seconds, too.
+    `first` names the work before the first unit is done; it is shown after that time, too.
     """
     from tqdm import tqdm
 
     interval, silent = 0.2 if sys.stderr.isatty() else 10.0, quiet.get()
-    with tqdm(
-        desc=label, unit=unit, delay=2, mininterval=interval, dynamic_ncols=True, file=sys.stderr, disable=silent
-    ) as shown:
+    options = {"unit": unit, "delay": SHOWN_AFTER, "mininterval": interval, "dynamic_ncols": True, "disable": silent}
+    with tqdm(desc=label, file=sys.stderr, **options) as shown:
 
         def begin() -> None:
             shown.last_print_t = time.time()  # it is shown, so its line must end
             shown.set_description_str(f"{label}, {first}")
 
-        waiting = threading.Timer(2.0, begin)
+        waiting = threading.Timer(SHOWN_AFTER, begin)
         waiting.daemon = True
 
         def update(done: int, total: int) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 
 from qsim.cli.console import OPTIONAL, RESUMES, command, failed, output
 from qsim.cli.options import check_free
+from qsim.terminal import is_lost
 
 MEASUREMENTS = Path(__file__).parents[1] / "measurements"
 MINUTES = "2"  # of training
@@ -65,7 +66,10 @@ def call(words: list[str], capture: bool) -> str:
 
     Ctrl-C reaches the command, too, which then saves its state: wait for it.
     """
-    child = subprocess.Popen(words, text=True, stdout=subprocess.PIPE if capture else None)
+    target = subprocess.PIPE if capture else None
+    if not capture and is_lost(sys.stdout):
+        target = subprocess.DEVNULL
+    child = subprocess.Popen(words, text=True, stdout=target)
     try:
         printed, _ = child.communicate()
     except KeyboardInterrupt:

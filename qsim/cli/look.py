@@ -13,6 +13,7 @@ from typing import Any
 from qsim import files
 from qsim.cli.console import bar, command, output, refuse_existing, refuse_idle
 from qsim.clip.manifest import check_outside
+from qsim.terminal import is_lost
 
 PREVIEWS = (".mp4", ".gif", ".png")
 FASTEST_GIF = 50  # frames per second; viewers slow down faster ones
@@ -120,6 +121,8 @@ def _show(args: argparse.Namespace, source: Any, views: list[Any], frames: range
         for t in frames:
             text = draw(preview.fit_terminal(view.picture(t), window.columns, max(window.lines - 4, 8)))
             print(text, flush=True)
+            if is_lost(sys.stdout):
+                return 0
             if t + 1 < frames.stop:
                 time.sleep(1 / args.fps)
                 print(preview.cursor_up(text) if coloured else "")

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import math
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -25,6 +26,7 @@ from torch.utils.data import DataLoader, Subset, default_collate
 from tqdm import tqdm
 
 from qsim.keys import Key
+from qsim.terminal import Tolerant
 from quiver import threads
 from quiver.data.clips import clips_digest, split_clips, unfinished
 from quiver.data.stream_windows import StreamWindows
@@ -154,7 +156,10 @@ class Board:
         from torch.utils.tensorboard import SummaryWriter
 
         self.writer = SummaryWriter(str(folder), purge_step=state.step or None)
-        self.bar = tqdm(total=settings.steps, initial=state.step, unit="step", disable=not show, mininterval=1)
+        shown_on = Tolerant(sys.stderr)
+        self.bar = tqdm(
+            total=settings.steps, initial=state.step, unit="step", disable=not show, mininterval=1, file=shown_on
+        )
         self.psnr = ""
 
     def step(self, state: State, loss: float, norm: float, rate: float) -> None:

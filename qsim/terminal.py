@@ -1,0 +1,102 @@
+"""Text streams whose failures do not end the work: a full device, a closed descriptor, a pipe without a reader.
+
+Progress and messages never decide a result. What cannot be written is dropped; a command reports a lost output at its
+end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any, TextIO, cast
+
+
+class Tolerant:
+    """A text stream that drops what cannot be written; None stands for a stream that the process lacks."""
+
+    def __init__(self, stream: TextIO | None) -> None:
+        self._stream = stream
+        self.failure: OSError | ValueError | None = None  # the first one
+
+    def write(self, text: str) -> int:
+        """Write a text; characters that the encoding of the stream lacks are written as escapes."""
+        if self._stream is not None:
+            try:
+                self._stream.write(text)
+            except UnicodeEncodeError:
+                encoding = self._stream.encoding or "ascii"
+                self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+            except (OSError, ValueError) as error:  # ValueError: the stream is closed
+                self._drop(error)
+        return len(text)
+
+    def flush(self) -> None:
+        """Write what is kept in memory."""
+        if self._stream is not None:
+            try:
+                self._stream.flush()
+            except (OSError, ValueError) as error:
+                self._drop(error)
+
+    def isatty(self) -> bool:
+        """Return whether this is an interactive terminal."""
+        try:
+            return self._stream is not None and self._stream.isatty()
+        except ValueError:
+            return False
+
+    def fileno(self) -> int:
+        """Return the descriptor; `OSError` (`io.UnsupportedOperation`) without one."""
+        if self._stream is None:
+            raise io.UnsupportedOperation("fileno")
+        return self._stream.fileno()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def _drop(self, error: OSError | ValueError) -> None:
+        """Note a failure; empty the stream's memory, which the interpreter would try to write again at its end."""
+        self.failure = self.failure or error
+        assert self._stream is not None
+        with contextlib.suppress(OSError, ValueError):
+            descriptor = self._stream.fileno()
+            kept = os.dup(descriptor)
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            try:
+                os.dup2(nowhere, descriptor)
+                self._stream.flush()
+            finally:
+                os.dup2(kept, descriptor)
+                os.close(kept)
+                os.close(nowhere)
+
+
+def is_lost(stream: object) -> bool:
+    """Return whether something could not be written to a stream of `tolerant_output`."""
+    return isinstance(stream, Tolerant) and stream.failure is not None
+
+
+@contextlib.contextmanager
+def tolerant_output() -> Iterator[tuple[Tolerant, Tolerant]]:
+    """Let the block print to standard output and standard error, which it receives, without a failure."""
+    open_descriptors()
+    out, err = Tolerant(sys.stdout), Tolerant(sys.stderr)
+    with contextlib.redirect_stdout(cast(TextIO, out)), contextlib.redirect_stderr(cast(TextIO, err)):
+        yield out, err
+        out.flush()
+        err.flush()
+
+
+def open_descriptors() -> None:
+    """Open the null device as each of the descriptors 0 to 2 that is closed.
+
+    Else a data file would take the number, and what a library prints there would be written into it.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # takes the lowest number that is free
