@@ -69,7 +69,7 @@ def _run_domain(args: argparse.Namespace) -> int:
         refuse(args, MEASURING, "is for measuring, and no clips are given")
         if args.force:
             raise ValueError("--force: is for measuring, and no clips are given; leave it out")
-        load(path)  # names a damaged file, and one of a network that was removed
+        load(path)  # names a damaged file
         found = read_scope(path, metadata_of(path)).domain
     if found is None:
         raise ValueError(f"{path}: was never measured; give clips that were not used for training or tuning")

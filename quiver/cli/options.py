@@ -16,7 +16,6 @@ from qsim.cli.console import note
 from qsim.cli.options import count, memory_size, numbers, positive, whole_numbers, words
 from qsim.files import check_ours
 from quiver.device import DEVICES
-from quiver.model.removed import RemovedError, refuse_name
 from quiver.restoration.interface import AUTO, MODES
 
 LEVELS = 16  # of a range of light in training: from 0.3 to 100 photons they are a factor 1.47 apart
@@ -33,16 +32,8 @@ def add_light(parser: argparse.ArgumentParser, several: bool, default: str = "3.
 
 
 def add_preset(parser: argparse.ArgumentParser, default: str, known: Sequence[str]) -> None:
-    """Add --preset; its error for a network that was removed names what takes its place."""
-
-    def name(text: str) -> str:
-        try:
-            refuse_name(text)
-        except RemovedError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-        return text
-
-    parser.add_argument("--preset", type=name, default=default, choices=known, help=f"network (default {default})")
+    """Add --preset."""
+    parser.add_argument("--preset", default=default, choices=known, help=f"network (default {default})")
 
 
 def light_levels(text: str) -> tuple[float, ...]:

@@ -16,7 +16,6 @@ from typing import Any
 from qsim import checks
 from qsim.cli.console import WITHOUT_FORCE, failed, note, output
 from qsim.cli.options import check_free, checked, count, nonnegative, positive
-from qsim.files import sha256
 from quiver.cli.options import (
     PROTOCOLS,
     add_noise,
@@ -98,6 +97,7 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver import threads
     from quiver.data.clips import split_clips
     from quiver.device import pick_device
+    from quiver.model.weights import digest
     from quiver.restoration.restorers import weights_path
     from quiver.training.loop import Diverged, train
     from quiver.training.run_folder import draw_curve
@@ -106,7 +106,7 @@ def _run_train(args: argparse.Namespace) -> int:
         args.after_interrupt = WITHOUT_FORCE
 
     first = None if args.start is None else weights_path(args.start)
-    args.start = None if first is None else _start(args, first)
+    args.start = None if first is None else digest(first)
     args.data = args.data[0] if len(args.data) == 1 else tuple(args.data)
     settings = _settings(args)
     if args.preset.startswith("bit2bit"):
@@ -144,17 +144,6 @@ def _run_train(args: argparse.Namespace) -> int:
         print(f"quiver: interrupted; {args.after_interrupt}", file=sys.stderr)
         return 130
     return 0
-
-
-def _start(args: argparse.Namespace, first: Path) -> str:
-    """Return the digest of the first weights; that of their file where a run of an earlier version began with it."""
-    from quiver.model.weights import digest
-    from quiver.training.run_folder import recorded_condition
-
-    earlier = sha256(first)
-    if not args.force and recorded_condition(Path(args.output), "start", None, None) == earlier:
-        return earlier
-    return digest(first)
 
 
 def _settings(args: argparse.Namespace) -> Any:

@@ -169,8 +169,6 @@ def _check_target(target: Path, meta: dict[str, Any]) -> None:
         return
     clip = Clip.open(target)
     wanted, found = dict(meta["source"]), clip.meta.get("source") or {}
-    if "sha256" not in found:  # an earlier version did not record it
-        del wanted["sha256"]
     same = list(clip.shape) == meta["shape"]
     if found == wanted and same:
         return

@@ -248,13 +248,7 @@ def evaluate(
             codes: Codes | None = None
             for method in methods:
                 precision, cut = settings_of(method, drawn)
-                keys = [
-                    (method.name, one.description, label, clip.name, precision, tiles)
-                    for one in (method, method.earlier)
-                    if one is not None
-                    for tiles in (cut, None)  # None: an earlier version did not record them
-                ]
-                key = next((one for one in keys if one in known), keys[0])
+                key = (method.name, method.description, label, clip.name, precision, cut)
                 if progress is not None:
                     progress(f"{method.name}, {clip.name}, {label}", len(rows), total)
                 if key not in known:
@@ -317,9 +311,7 @@ def begin(comparison: Comparison, out: Path, clips: Sequence[Clip]) -> list[Comp
         out.mkdir(parents=True, exist_ok=True)
         write_json(path, wanted)
     elif (found := read_json(path)) != wanted:
-        if "content_sha256" not in found or content | found != wanted:
-            changed = found | content == wanted
-            what = "rows of clips, streams or sensors that were changed since" if changed else "another evaluation"
-            raise FileExistsError(f"{out} holds {what}; choose another -o, or start again with --force")
-        write_json(path, wanted)  # an earlier version did not record the sensor files
+        changed = found | content == wanted
+        what = "rows of clips, streams or sensors that were changed since" if changed else "another evaluation"
+        raise FileExistsError(f"{out} holds {what}; choose another -o, or start again with --force")
     return stored_rows(out / "rows.jsonl")

@@ -34,12 +34,12 @@ class ComparisonRow:
     motion_squares: tuple[float, ...] = ()  # squared error summed over them, matched, in units of the peak
     failure: str | None = None
     precision: str = RestoreOptions.precision
-    cut: str | None = None  # tiles of a frame where they change the answer, else empty; None: not recorded earlier
-    device: str | None = None  # where it was restored; None: not recorded earlier
-    threads: int | None = None  # of torch; None: not recorded earlier, or without torch
+    cut: str = ""  # tiles of a frame where they change the answer, else empty
+    device: str = "cpu"  # where it was restored
+    threads: int | None = None  # of torch; None: without torch
 
     @property
-    def key(self) -> tuple[str, str, str, str, str, str | None]:
+    def key(self) -> tuple[str, str, str, str, str, str]:
         """Return what must agree for an old result to count."""
         return self.method, self.description, self.light, self.clip, self.precision, self.cut
 

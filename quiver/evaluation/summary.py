@@ -53,15 +53,12 @@ class SummaryLine:
     psnr_by_motion: list[float]  # dB, matched, all pixels of a bin of breakdown.EDGES pooled; NaN = no pixel
     seconds_per_frame: float  # NaN where devices or threads differ
     peak_bytes: int | None  # of memory, largest over clips; None where devices or threads differ
-    devices: tuple[str | None, ...]  # where the clips were restored; None: not recorded
-    threads: tuple[int | None, ...]  # of torch; None: not recorded
+    devices: tuple[str, ...]  # where the clips were restored
+    threads: tuple[int | None, ...]  # of torch; None: without torch
     above_peak: float  # share of target pixels above the peak, largest over clips
     truth_psnr: float | None  # dB, mean over clips
     near_truth: tuple[str, ...]  # PSNR scores within metrics.NEAR_TRUTH of that of the truth, in some clip
     failures: tuple[str, ...]  # clip: reason
-
-
-ROUNDING = 1e-9  # earlier versions stored the rounding of one factor per clip as its spread over windows
 
 
 def mean(values: Sequence[float]) -> float:
@@ -95,7 +92,7 @@ def _line(method: str, light: str, rows: Sequence[ComparisonRow]) -> SummaryLine
         scores={name: over_scenes([getattr(s, name) for _, s in good], [r.scene for r, _ in good]) for name in SCORES},
         psnr_matched_per_frame=sum(psnr * n for psnr, n in by_frames) / frames if frames else math.nan,
         scale=mean(scales),
-        scale_spread=within if within > ROUNDING else spread,
+        scale_spread=within if within > 0 else spread,
         psnr_by_motion=breakdown.pooled([row.motion_pixels for row in moved], [row.motion_squares for row in moved]),
         seconds_per_frame=mean([row.seconds_per_frame for row in alike]),
         peak_bytes=max((row.peak_bytes for row in alike if row.peak_bytes is not None), default=None),
@@ -221,7 +218,8 @@ def _mixed(lines: Sequence[SummaryLine]) -> list[str]:
     told = []
     for line in lines:
         if max(len(line.devices), len(line.threads)) > 1:
-            devices, threads = (", ".join(str(x or "not recorded") for x in xs) for xs in (line.devices, line.threads))
+            devices = ", ".join(line.devices)
+            threads = ", ".join(str(count or "without torch") for count in line.threads)
             told.append(f"{line.method}, {line.light} (devices: {devices}; threads: {threads})")
     return [f"No time and memory, because not all clips were restored alike: {'; '.join(told)}.", ""] if told else []
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from quiver.model.config import Config
 from quiver.model.quiver import QUIVER
-from quiver.model.weights import FORMAT, load, read_safetensors, read_torch, save
+from quiver.model.weights import FORMAT, read_safetensors, read_torch, save
 
 WRAPPERS = ("state_dict", "model_state_dict", "model", "params", "net")  # around a state dict
 
@@ -166,7 +166,6 @@ def _read_foreign(path: Path) -> dict[str, Tensor]:
     if path.suffix == ".safetensors":
         state, metadata = read_safetensors(path)
         if metadata.get("format") == FORMAT:
-            load(path)  # raises for those of a network that was removed
             raise ValueError(f"{path}: holds weights of this program; they need no conversion")
         return {name.removeprefix("module."): value for name, value in state.items()}
     try:

@@ -1,4 +1,4 @@
-"""Writes and reads weights as safetensors files, also those of earlier versions.
+"""Writes and reads weights as safetensors files.
 
 No pickled code is executed: our files are safetensors, and torch reads other checkpoints with `weights_only=True`.
 """
@@ -8,7 +8,7 @@ import json
 import pickle
 import warnings
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from qsim.files import write_bytes
-from quiver.model.config import Config
 from quiver.model.presets import NETWORKS
-from quiver.model.quiver import QUIVER
-from quiver.model.removed import INSTEAD, NAME, RemovedError
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files
 MAX_CONFIG = 10_000  # characters of a configuration
@@ -31,31 +28,6 @@ DAMAGE = (  # errors that torch raises for damaged files and other content
     *(RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError, OverflowError, MemoryError),
     *(RecursionError, pickle.UnpicklingError, zipfile.BadZipFile, NotImplementedError, AssertionError),
 )
-# Fields that earlier versions had beside those of Config, with the values of every QUIVER; nano had others.
-EARLIER: dict[str, object] = {
-    "deformable_kernel": 3,
-    "denoiser_passes": 5,
-    "flow_kernel": 7,
-    "flow_levels": 4,
-    "cell_blocks": 11,
-    "attention_width": None,
-    "attention_temperature": None,
-    "fold": 1,
-    "baseline": 0,
-    "estimate_width": 0,
-    "sweep": 0.0,
-    "largest_velocity": 0.0,
-    "lecun": False,
-}
-# Earlier fields: the noise of the sensor is now an input of these networks.
-NO_FIELDS = {"EMVD": ("variance",), "FloRNN": ("variance",), "FastDVDnet": ("variance",)}
-RENAMED_PARTS = {"hourglass": "body"}  # earlier part of a network: part today
-
-
-def current_names(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the state dict of this version or an earlier one under the names of this version."""
-    parts = (name.partition(".") for name in state)
-    return {RENAMED_PARTS.get(a, a) + dot + b: value for (a, dot, b), value in zip(parts, state.values(), strict=True)}
 
 
 def read_torch(path: Path, device: torch.device | str = "cpu") -> Any:
@@ -112,13 +84,10 @@ def load(path: Path) -> nn.Module:
         values = json.loads(metadata["config"])
         with torch.device("meta"), _WithoutValues():
             network = _build(metadata["network"], values)
-        tensors = current_names(tensors)
         for name, value in network.state_dict().items():
             if name in tensors and tensors[name].dtype != value.dtype:
                 raise ValueError(f"{name} holds {tensors[name].dtype}, the network {value.dtype}")
         network.load_state_dict(tensors, assign=True)
-    except RemovedError as error:
-        raise RemovedError(f"{path}: {error}") from None
     except DAMAGE as error:
         reason = " ".join(str(error).split())[:MAX_REASON]
         raise ValueError(f"{path}: weights and configuration do not fit ({reason})") from None
@@ -169,31 +138,11 @@ class _WithoutValues(TorchFunctionMode):
 
 
 def _build(kind: str, values: dict[str, object]) -> nn.Module:
-    if kind in ("QUIVER", "FoldedQUIVER"):
-        return QUIVER(_config_of(kind, values))
+    """Return the network of a kind and the values of its configuration; `ValueError` for others."""
     for network, config in NETWORKS:
         if kind == network.__name__:
-            return network(config.from_dict(without(values, NO_FIELDS.get(kind, ()))))  # type: ignore[attr-defined]
+            return network(config.from_dict(values))  # type: ignore[attr-defined]
     raise ValueError(f"no network is called {kind[:60]!r}")
-
-
-def without(values: dict[str, object], names: Sequence[str]) -> dict[str, object]:
-    """Return values without some; anything but a table is returned unchanged."""
-    return {name: value for name, value in values.items() if name not in names} if isinstance(values, dict) else values
-
-
-def _config_of(kind: str, values: dict[str, object]) -> Config:
-    """Return the configuration of a QUIVER, which earlier versions wrote with more fields; `RemovedError` for nano.
-
-    A FoldedQUIVER of earlier versions without folding and estimate was a QUIVER of other sizes.
-    """
-    if not isinstance(values, dict):
-        raise ValueError("the configuration is not a table of values")
-    earlier = {name: value for name, value in values.items() if name in EARLIER}
-    published = all(EARLIER[name] == value for name, value in earlier.items())
-    if not published or (kind == "FoldedQUIVER" and "fold" not in earlier):
-        raise RemovedError(f"weights of {NAME} (FoldedQUIVER), a network that was removed; {INSTEAD}")
-    return Config.from_dict({name: value for name, value in values.items() if name not in EARLIER})
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -76,7 +76,6 @@ class Restorer:
     together: int = 1  # frames that are restored at a time and share most of the work
     scope: Scope | None = None  # of a network: the streams that it was measured for or trained on; None: not known
     device: str = "cpu"  # where it runs
-    earlier: Restorer | None = None  # with the description and identity that earlier versions stored, if they differ
     seen: int | None = None  # most frames used for one, if the first and the last of `window` are never used together
 
     @property

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.files import Progress, sha256
+from qsim.files import Progress
 from quiver.baselines.sliding_window import reflect
 from quiver.data.clips import peak_of
 from quiver.data.codes import Codes, frame_reader, light_of
@@ -40,11 +40,10 @@ def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
     model = load(path)
     name = Path(os.path.abspath(path)).parent.name if path.name == "best.safetensors" else path.stem
 
-    def described(known: str) -> Restorer:
-        description = f"{network_title(model)}, weights {known[:12]}"
-        return wrap_network(model, name, description, options, weights_sha256=known)
-
-    return replace(described(digest(path)), scope=read_scope(path, metadata_of(path)), earlier=described(sha256(path)))
+    known = digest(path)
+    description = f"{network_title(model)}, weights {known[:12]}"
+    restorer = wrap_network(model, name, description, options, weights_sha256=known)
+    return replace(restorer, scope=read_scope(path, metadata_of(path)))
 
 
 def network_title(model: nn.Module) -> str:

@@ -68,7 +68,7 @@ def restore_to_file(
         if unnamed(path):
             os.replace(journal, path.with_suffix(".json"))
             sync_folder(path.parent)
-            if not _resumable(path, path.with_suffix(".json"), method, meta)[2]:
+            if not _done(path, path.with_suffix(".json"), meta)[2]:
                 return read_json(path.with_suffix(".json"))
         _check_target(path, journal, force)
         try:
@@ -178,7 +178,7 @@ def _fill_file(
 ) -> float:
     """Restore the missing frames of PART, record each block in JOURNAL, and return the seconds of all blocks."""
     length = codes.shape[0]
-    done, seconds, why = _resumable(part, journal, method, meta)
+    done, seconds, why = _done(part, journal, meta)
     if why and note is not None:
         note(f"{part}: holds an interrupted restoration, but {why}; starting again")
     if not done:
@@ -219,16 +219,6 @@ def _reserve(part: Path, shape: tuple[int, ...]) -> None:
         else:  # macOS
             for written in range(start, stop, ZEROS):
                 file.write(bytes(min(ZEROS, stop - written)))
-
-
-def _resumable(part: Path, journal: Path, method: Restorer, meta: dict[str, Any]) -> tuple[int, float, str]:
-    """Return what `_done` returns, also for a journal of an earlier version, which described the method otherwise."""
-    found, earlier = _done(part, journal, meta), method.earlier
-    if not found[2] or earlier is None:
-        return found
-    identity = dict(earlier.identity) | {"cut": meta["identity"]["cut"]}
-    before = _done(part, journal, meta | {"description": earlier.description, "identity": identity})
-    return found if before[2] else before
 
 
 def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, str]:

@@ -24,7 +24,6 @@ from qsim.files import Progress
 from quiver.baselines import METHODS, exposures
 from quiver.baselines.sliding_window import look_ahead
 from quiver.data.codes import Codes
-from quiver.model import removed
 from quiver.restoration.interface import AUTO, NETWORKS, RestoreInto, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 
@@ -119,10 +118,8 @@ def weights_path(name: str) -> Path:
         return path
     if (path / "best.safetensors").is_file():
         return path / "best.safetensors"
-    removed.refuse_run(path)
     if (path / "settings.json").is_file():
         raise FileNotFoundError(f"{path}: a training run without best.safetensors; continue it until it has validated")
-    removed.refuse_name(name)
     if name.partition(":")[0] == AUTO:
         raise ValueError(
             f"{name}: `auto` chooses the method of one stream, for `quiver restore`, and has no window; name one of "

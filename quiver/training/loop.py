@@ -33,10 +33,9 @@ from quiver.data.stream_windows import StreamWindows
 from quiver.data.windows import Batches, Windows, WindowSettings
 from quiver.device import is_gpu, moved
 from quiver.evaluation import metrics
-from quiver.model.removed import refuse_run
 from quiver.training.optimiser import Optimiser
 from quiver.training.processes import Process, begin_worker, joined, plain_errors
-from quiver.training.run_folder import Run, recorded_frames
+from quiver.training.run_folder import Run
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
 from quiver.training.self_supervised import make_stream_windows
 from quiver.training.settings import Settings, settled
@@ -292,10 +291,7 @@ def train(
     with joined(device) as process, contextlib.ExitStack() as stack:
         asked, system = settings.threads, system_of(model)
         system.refuse(model, settings)
-        refuse_run(Path(settings.out), replaced=force)
         validated = system.validated(model, settings)
-        if not force:  # a run of an earlier version ends as it began
-            validated = recorded_frames(Path(settings.out), validated, system.window(model))
         windows: AnyWindows
         fixed: Subset[dict[str, Any]] | None = None
         if system.of_stream:

@@ -49,7 +49,6 @@ def _load_weights(model: nn.Module, stored: Any) -> None:
     own = model.state_dict()
     if not isinstance(stored, dict) or not all(isinstance(name, str) for name in stored):
         raise ValueError("weights of another network")
-    stored = weights.current_names(stored)
     if set(stored) != set(own):
         raise ValueError("weights of another network")
     for name, value in stored.items():
@@ -84,21 +83,6 @@ def empty(folder: Path) -> None:
             shutil.rmtree(path)
         elif path.name != LOCK:
             path.unlink()
-
-
-def recorded_condition(folder: Path, name: str, now: Any, earlier: Any) -> Any:
-    """Return a condition of the run in a folder, `earlier` if its version wrote none, `now` where there is no run."""
-    path = folder / "settings.json"
-    return read_json(path).get(name, earlier) if path.is_file() else now
-
-
-def recorded_frames(folder: Path, now: int, earlier: int) -> int:
-    """Return the frames of the validation windows as `recorded_condition`; `ValueError` if the file is damaged."""
-    found = recorded_condition(folder, "validated_frames", now, earlier)
-    if type(found) is not int or found < 1:
-        path = folder / "settings.json"
-        raise ValueError(f"{path}: validated_frames is {short(found)}; the file is damaged, start again with --force")
-    return found
 
 
 class Run:
@@ -142,7 +126,7 @@ class Run:
 
     def _check_settings(self) -> None:
         wanted, found = self.settings.to_dict(), read_json(self.folder / "settings.json")
-        free = {"out", "workers", "threads"} | ({"noise"} - found.keys())  # earlier versions wrote no noise
+        free = {"out", "workers", "threads"}
         for name in wanted:
             if name not in free and _alone(found.get(name)) != _alone(wanted[name]):
                 before = "as in its data set" if found.get(name) is None else short(found[name])
@@ -151,10 +135,10 @@ class Run:
                     "another -o, or start again with --force"
                 )
         for name, value in self.conditions.items():
-            before = found.get(name, value)  # earlier versions wrote none
-            if before != value:
+            begun = found.get(name)
+            if begun != value:
                 raise FileExistsError(
-                    f"{self.folder} {CONDITIONS[name].format(short(before), short(value))}; resume it as it began, "
+                    f"{self.folder} {CONDITIONS[name].format(short(begun), short(value))}; resume it as it began, "
                     "choose another -o, or start again with --force"
                 )
 

@@ -150,7 +150,7 @@ def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}; the file is damaged, start again with --force") from None
     files = tuple(name for name in settings.sensors or () if name.endswith(".toml"))
-    if files and "noise" in found and _of_files(mixture.noises) != _of_files(noise):
+    if files and _of_files(mixture.noises) != _of_files(noise):
         raise FileExistsError(
             f"{settings.out} holds a run with noise: {describe(noise)}; {', '.join(files)} now describes other noise; "
             "choose another -o, or start again with --force"
@@ -168,13 +168,11 @@ def _as_tuple(value: Any) -> Any:
 
 
 def _recorded(found: Mapping[str, Any]) -> tuple[Noise, ...]:
-    """Return the noise of a stored run; those of earlier versions stored sensor, bits and ppp, and had no defects."""
-    if found.get("noise") is not None:
-        if not isinstance(found["noise"], list) or not found["noise"]:
-            raise ValueError(f"noise is {short(found['noise'])}")
-        return tuple(Noise.from_dict(values) for values in found["noise"])
-    old = Settings("", "", steps=1, **{name: _as_tuple(found.get(name)) for name in _ASKED})
-    return tuple(replace(Noise.of(light), defects=None) for light in old.lights)
+    """Return the noise of a stored run; `ValueError` if it is no list of them."""
+    noises = found.get("noise")
+    if not isinstance(noises, list) or not noises:
+        raise ValueError(f"noise is {short(noises)}")
+    return tuple(Noise.from_dict(values) for values in noises)
 
 
 def portable(settings: Settings) -> dict[str, Any]:

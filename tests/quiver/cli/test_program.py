@@ -13,6 +13,7 @@ import torch
 from golden import published_state
 from safetensors.torch import save_file
 
+from qsim import files
 from qsim.cli.options import memory_size
 from qsim.locks import Lock
 from quiver.cli.program import main
@@ -181,7 +182,7 @@ def test_arrays_that_are_no_stream_are_refused(capsys, tmp_path, array, message)
 
 def test_restored_video_is_not_taken_for_a_stream(capsys, tmp_path):
     np.save(tmp_path / "v.npy", np.ones((3, 4, 4), np.float32))
-    (tmp_path / "v.json").write_text('{"method": "moment", "seconds_per_frame": 0.1}')
+    files.write_description(tmp_path / "v.json", {"method": "moment", "seconds_per_frame": 0.1})
     said = mistake(capsys, "restore", tmp_path / "v.npy", "-o", tmp_path / "w.npy", "--method", "moment")
     assert "v.npy: is restored video; name the stream" in said
     assert not (tmp_path / "w.npy").exists()

@@ -103,8 +103,8 @@ def test_a_sensor_file_that_changed_is_another_run(tiny_dataset, tmp_path):
         train(network(), small(tiny_dataset, tmp_path / "r", sensor=file), progress=False)
 
 
-def test_a_sensor_file_does_not_end_a_run_of_an_earlier_mixture(data, tmp_path):
-    """Earlier versions drew each of several sensors at the light of the streams of all."""
+def test_a_run_keeps_its_mixture(data, tmp_path):
+    """Noise that the sensor files alone would not give."""
     run = small(data, tmp_path / "r", sensor=("spad-320x240", sensor_file(tmp_path, QIS, 3)))
     begun, _ = settled(run)
     more = (*begun.noise, replace(begun.noise[-1], ppp=7.0))
@@ -123,22 +123,6 @@ def test_weights_tell_their_noise_without_folders(data, tmp_path):
     assert (told["sensor"], told["ppp"], told["bits"]) == ("spad-320x240", [1.0, 10.0], [1])
     assert str(tmp_path) not in text
     assert restorer(str(tmp_path / "r")).learned, "the map is not there under its bare name, and is not needed"
-
-
-def test_a_run_of_an_earlier_version_is_resumed(data, tmp_path):
-    """Its settings have no `noise` and no `threads`; it keeps sensor, bits and light, and draws the same windows."""
-    asked = {"sensor": "quiver-physical", "ppp": (3.25,), "bits": (3,)}
-    before = network()
-    train(before, small(data, tmp_path / "r", steps=2, **asked), progress=False)
-    path = tmp_path / "r/settings.json"
-    old = {k: v for k, v in json.loads(path.read_text()).items() if k not in ("noise", "threads")}
-    path.write_text(json.dumps(old))
-    (tmp_path / "r/checkpoint.pt").unlink()
-    said: list[str] = []
-    again = network()
-    train(again, small(data, tmp_path / "r", steps=2), progress=False, note=said.append)
-    assert said[0] == "noise: quiver-physical, 3 bits, 3.25 PPP (as this run began)"
-    assert all(torch.equal(a, b) for a, b in zip(before.parameters(), again.parameters(), strict=True))
 
 
 HOSTILE = (

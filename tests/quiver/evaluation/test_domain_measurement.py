@@ -85,14 +85,14 @@ def cells_without_measuring(monkeypatch: pytest.MonkeyPatch) -> list[Illuminatio
 
 
 def test_cells_of_another_mode_precision_or_cut_are_not_taken(tiny_dataset, tmp_path, monkeypatch):
-    """Cells of an earlier version, which did not record them, are those of the usual mode and precision."""
+    """Cells that record none are those of the usual mode and precision."""
     path, asked = tmp_path / "small.safetensors", cells_without_measuring(monkeypatch)
     save(QUIVER(SMALL), SMALL, path)
     settings = DomainSettings(domain_measurement.clips_of([tiny_dataset], "test"), (Illumination(),), ("naive",))
     usual = RestoreOptions(device="cpu")
-    earlier = Domain((cell(3.25, 21.0),), settings.to_dict())
-    annotate(path, {domain.KEY: earlier.to_json()})
-    assert domain_measurement.measure(path, settings, usual).cells == earlier.cells
+    stored = Domain((cell(3.25, 21.0),), settings.to_dict())
+    annotate(path, {domain.KEY: stored.to_json()})
+    assert domain_measurement.measure(path, settings, usual).cells == stored.cells
     assert not asked
     for name, options in (
         ("mode", replace(usual, mode="streaming")),

@@ -1,4 +1,4 @@
-"""Tests weights files: ours, those of earlier versions, and files with wrong values of every kind."""
+"""Tests weights files: ours, and files with wrong values of every kind."""
 
 from __future__ import annotations
 
@@ -24,12 +24,9 @@ from qsim.process import peak_memory, reset_peak
 from quiver.model.config import Config
 from quiver.model.presets import OTHERS
 from quiver.model.quiver import QUIVER
-from quiver.model.rivals.emvd import EMVD, EMVDConfig
 from quiver.model.unet import UNet, UNetConfig
-from quiver.model.weights import EARLIER, RENAMED_PARTS, annotate, digest, load, save
+from quiver.model.weights import annotate, digest, load, save
 from quiver.restoration.restorers import weights_path
-
-EARLIER_TINY = TINY.to_dict() | EARLIER  # sizes that are fixed now were fields
 
 
 def notes(path: Path) -> dict[str, str]:
@@ -76,56 +73,6 @@ def test_a_digest_is_that_of_what_decides_results(tmp_path: Path):
         save_file(values, path, metadata)
         found.add(digest(path))
     assert len(found) == len(changed) + 1
-
-
-def earlier(network: nn.Module, config: dict[str, object], path: Path) -> None:
-    """Write weights as earlier versions did, with their names of parts."""
-    old = {new: name for name, new in RENAMED_PARTS.items()}
-    parts = ((name.partition("."), value) for name, value in network.state_dict().items())
-    tensors = {old.get(part, part) + dot + rest: value.contiguous() for (part, dot, rest), value in parts}
-    about = {"format": "quiver-1", "network": type(network).__name__, "config": json.dumps(config)}
-    save_file(tensors, path, about)
-
-
-@pytest.mark.parametrize(
-    "network",
-    [
-        QUIVER(Config(16, flow=False, cell_growth=3)),
-        UNet(UNetConfig(2)),
-    ],
-    ids=["quiver", "unet"],
-)
-def test_weights_of_earlier_versions_are_read(tmp_path: Path, network):
-    """Their configuration held every size of the published design, and parts had other names."""
-    config = network.config.to_dict()
-    if not isinstance(network, UNet):
-        config = EARLIER | config
-    earlier(network, config, tmp_path / "w.safetensors")
-    back = load(tmp_path / "w.safetensors")
-    assert type(back) is type(network)
-    assert back.config == network.config
-    for name, value in network.state_dict().items():
-        assert torch.equal(back.state_dict()[name], value), name
-
-
-def test_a_small_quiver_of_an_earlier_version_is_read(tmp_path: Path):
-    """It was a FoldedQUIVER without folding; now QUIVER itself has these sizes."""
-    network, path = QUIVER(TINY), tmp_path / "w.safetensors"
-    tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
-    values = json.dumps(EARLIER_TINY)
-    save_file(tensors, path, {"format": "quiver-1", "network": "FoldedQUIVER", "config": values})
-    back = load(path)
-    assert type(back) is QUIVER
-    assert back.config == TINY
-    assert all(torch.equal(back.state_dict()[name], value) for name, value in tensors.items())
-
-
-def test_a_noise_table_of_an_earlier_version_is_left_out(tmp_path: Path):
-    network = EMVD(EMVDConfig(width=2))
-    earlier(network, network.config.to_dict() | {"variance": [0.0, 0.1]}, tmp_path / "w.safetensors")
-    back = load(tmp_path / "w.safetensors")
-    assert isinstance(back, EMVD)
-    assert back.config == network.config
 
 
 def test_every_network_is_read_with_equal_values_and_without_slow_imports(tmp_path: Path):
@@ -242,19 +189,6 @@ def test_any_value_of_any_key_of_a_configuration_of_any_network(tmp_path, name):
             assert load(path).config == type(network.config).from_dict(config), (key, value)
 
 
-@pytest.mark.parametrize("kind", ["QUIVER", "FoldedQUIVER"])
-@pytest.mark.parametrize("key", sorted(EARLIER))
-def test_any_value_of_any_key_of_an_earlier_configuration(tiny, tmp_path, key, kind):
-    """Only the values of every QUIVER load; others are of nano."""
-    path = tmp_path / "w.safetensors"
-    for value in (*VALUES, EARLIER[key]):
-        config = json.dumps(EARLIER_TINY | {key: value})
-        save_file(tiny, path, {"format": "quiver-1", "network": kind, "config": config})
-        assert refused_or_loaded(path) == (value != EARLIER[key])
-        if value == EARLIER[key]:
-            assert load(path).config == TINY
-
-
 @pytest.mark.parametrize(
     "changes",
     [{"deformable_groups": 0}, {"flow_channels": []}, {"denoiser_growth": 10**9}, {"flow_channels": [10**9]}],
@@ -262,7 +196,7 @@ def test_any_value_of_any_key_of_an_earlier_configuration(tiny, tmp_path, key, k
 )
 def test_configurations_that_crashed_or_hung(tiny, tmp_path, changes):
     path = tmp_path / "w.safetensors"
-    metadata = {"format": "quiver-1", "network": "QUIVER", "config": json.dumps(EARLIER_TINY | changes)}
+    metadata = {"format": "quiver-1", "network": "QUIVER", "config": json.dumps(TINY.to_dict() | changes)}
     save_file(tiny, path, metadata)
     assert refused_or_loaded(path)
 
@@ -270,11 +204,7 @@ def test_configurations_that_crashed_or_hung(tiny, tmp_path, changes):
 @pytest.mark.parametrize(
     ("network", "config"),
     [
-        *(
-            (kind, text)
-            for kind in ("QUIVER", "FoldedQUIVER", "UNet")
-            for text in ("", "3", "null", "[]", "[" * 5000, "{", '"x"')
-        ),
+        *((kind, text) for kind in ("QUIVER", "UNet") for text in ("", "3", "null", "[]", "[" * 5000, "{", '"x"')),
         *(("UNet", json.dumps({"width": value})) for value in VALUES if value not in (1, 2, 3, 7, 64, True)),
         ("x" * 5000, "{}"),
         ("", "{}"),
@@ -290,10 +220,10 @@ def test_a_configuration_that_is_none(tmp_path, network, config):
 def test_many_wrong_values_at_once(tiny, tmp_path, seed):
     rng, path = random.Random(seed), tmp_path / "w.safetensors"
     for _ in range(25):
-        kind, wanted = rng.choice([("QUIVER", TINY.to_dict()), ("FoldedQUIVER", EARLIER_TINY)])
+        wanted = TINY.to_dict()
         keys = rng.sample(sorted(wanted), rng.randint(1, 4))
         config = json.dumps(wanted | {key: rng.choice(VALUES) for key in keys})
-        save_file(tiny, path, {"format": "quiver-1", "network": kind, "config": config})
+        save_file(tiny, path, {"format": "quiver-1", "network": "QUIVER", "config": config})
         refused_or_loaded(path)
 
 

@@ -19,7 +19,6 @@ from forks import forked, killed_at
 from numpy import ndarray as Array
 
 from qsim.clip.sensing import Sensing, sense
-from qsim.files import sha256
 from qsim.sensor.qis import QIS
 from quiver.cli.program import main
 from quiver.data.codes import Codes, array_codes, open_stream, sensed, stream_codes
@@ -91,17 +90,12 @@ def weights(folder: Path, seed: int) -> Path:
     return path
 
 
-@pytest.mark.parametrize("began", ["as now", "in an earlier version"])
-def test_weights_with_other_notes_are_the_same(tmp_path, blocks_of_four, began):
-    """Cells are notes. Earlier versions named the digest of the file: it is taken while the file is the same."""
+def test_weights_with_other_notes_are_the_same(tmp_path, blocks_of_four):
+    """Cells are notes."""
     codes, path, options = random_codes(), weights(tmp_path, 0), RestoreOptions(device="cpu")
     network = restorer(str(path), options)
-    if began == "as now":
-        interrupted(codes, network, tmp_path / "r.npy")
-        annotate(path, {"step": "7"})
-    else:
-        interrupted(codes, replace(network.earlier, fill=network.fill), tmp_path / "r.npy")
-        assert sha256(path) in (tmp_path / "r.npy.part.json").read_text()
+    interrupted(codes, network, tmp_path / "r.npy")
+    annotate(path, {"step": "7"})
     assert resumed(codes, restorer(str(path), options), tmp_path / "r.npy") == ([4, 8], [])
 
 

@@ -27,9 +27,9 @@ from quiver.cli.program import main
 from quiver.model.unet import UNet, UNetConfig
 from quiver.training.loop import train
 from quiver.training.optimiser import Optimiser
-from quiver.training.run_folder import Run, recorded_condition
+from quiver.training.run_folder import Run
 from quiver.training.schedule import State
-from quiver.training.settings import Settings
+from quiver.training.settings import Settings, settled
 
 ROOT = Path(__file__).parents[3]
 
@@ -83,33 +83,11 @@ def test_other_conditions_are_refused(tmp_path, name, began, now, says):
         again(now)
     again(now, force=True)
     again(now)
-    opened(Settings("d", str(tmp_path / "old"), steps=1))  # of an earlier version, which stored none
-    with Run(Settings("d", str(tmp_path / "old"), steps=1), {name: now}).open():
-        pass
-
-
-def test_a_run_of_an_earlier_version_is_validated_as_it_began(tmp_path):
-    opened(Settings("d", str(tmp_path / "old"), steps=1))
-    with Run(Settings("d", str(tmp_path / "new"), steps=1), {"validated_frames": 24}).open():
-        pass
-    asked = [(tmp_path / name, "validated_frames", 40, 11) for name in ("old", "new", "none")]
-    assert [recorded_condition(*words) for words in asked] == [11, 24, 40]
-
-
-@pytest.mark.parametrize("value", ["eleven", 0, True, 11.5, None])
-def test_a_damaged_number_of_frames_is_one_line(tiny_dataset, tmp_path, capsys, value):
-    with Run(settings(tiny_dataset, tmp_path / "r"), {"validated_frames": value}).open():
-        pass
-    words = ["--steps", "6", "--crop", "16", "--preset", "unet", "--threads", "1"]
-    assert main(["train", str(tiny_dataset), "-o", str(tmp_path / "r"), *words]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert f"validated_frames is {value!r}; the file is damaged, start again with --force" in said
 
 
 def test_one_process_at_a_time_trains_in_a_folder(tiny_dataset, tmp_path):
     """A second command is refused in one line, also with --force; the folder does not change."""
-    mine = settings(tiny_dataset, tmp_path / "r")
+    mine, _ = settled(settings(tiny_dataset, tmp_path / "r"))
     words = [sys.executable, "-m", "quiver", "train", tiny_dataset, "-o", mine.out, "--steps", 6, "--crop", 16]
     words += ["--preset", "unet"]
     with Run(mine).open():
