@@ -195,8 +195,8 @@ def write_description(path: Path, value: dict[str, Any]) -> str:
 
 
 def check_own(path: Path, description: dict[str, Any], cure: str) -> None:
-    """Raise `ValueError` if a description was changed; one without a checksum (earlier versions) passes."""
-    if "checksum" in description and description["checksum"] != checksum(description):
+    """Raise `ValueError` unless a description holds the checksum of its other keys."""
+    if description.get("checksum") != checksum(description):
         raise ValueError(f"{path}: contents changed (checksum differs); {cure}")
 
 

@@ -199,20 +199,16 @@ def _run_check(args: argparse.Namespace) -> int:
     from qsim.dataset import checking, redraw
 
     problems: list[str] = []
-    unsealed: list[Path] = []
     again: list[redraw.Redrawn] = []
     for path in args.paths:
         with bar(str(path), "clip" if (path / "dataset.json").is_file() else "file") as progress:
-            found = checking.check(path, progress)
-        problems += found.problems
-        unsealed += found.unsealed
+            problems += checking.check(path, progress)
         if args.redraw:
             with bar(f"{path} again", "stream") as progress:
                 again += redraw.redraw(path, progress)
     names = ", ".join(str(path) for path in args.paths)
     facts: dict[str, Any] = {"paths": [str(path) for path in args.paths], "problems": problems}
-    facts["without_checksum"] = [str(path) for path in unsealed]
-    lines = checking.Verdict(problems, unsealed).lines(names)
+    lines = checking.lines(problems, names)
     if args.redraw:
         facts["redrawn"] = [dataclasses.asdict(one) | {"path": str(one.path), "wrong": one.wrong} for one in again]
         lines += redraw.lines(again)

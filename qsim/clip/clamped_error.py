@@ -4,8 +4,7 @@
     PSNR  = 20 log10(white / rms error), clamped; beside it the same without the clamp
 
 The white of a clip is known when all frames are rendered. A frame therefore stores its clamped error at several whites
-around the one that the pilot predicted, and the clip interpolates at its own. Clips of earlier versions store errors
-below the 99.9th percentile, without a clamp; `stated` returns the kind.
+around the one that the pilot predicted, and the clip interpolates at its own.
 """
 
 from __future__ import annotations
@@ -136,26 +135,24 @@ class Stated:
     """The PSNR of a clip's radiance [dB] and its reference level."""
 
     psnr: float
-    unclamped: float | None  # below the same white; None for clips of earlier versions, which store one value
+    unclamped: float  # below the same white
     below: str  # the reference level
 
     @property
     def line(self) -> str:
         """`38.1 dB below white (2.5 x the mean), clamped there; 35.0 dB unclamped`."""
-        unclamped = "" if self.unclamped is None else f", clamped there; {self.unclamped:.1f} dB unclamped"
-        return f"{self.psnr:.1f} dB below {self.below}{unclamped}"
+        return f"{self.psnr:.1f} dB below {self.below}, clamped there; {self.unclamped:.1f} dB unclamped"
 
 
 def stated(meta: dict[str, Any]) -> Stated | None:
     """Return the PSNR of the radiance that clip.json holds; None if none was measured."""
-    psnr, white = meta.get("psnr_of_truth"), meta.get("white")
+    psnr = meta.get("psnr_of_truth")
     if psnr is None:
         return None
-    if white is None:
-        return Stated(psnr, None, "the 99.9th percentile (a clip of an earlier version)")
+    white = meta["white"]
     by_mean = math.isclose(white, WHITE_PER_MEAN * meta["mean_radiance"], rel_tol=1e-6)
     rule = f"{WHITE_PER_MEAN:g} x the mean" if by_mean else "the 99.9th percentile"
-    return Stated(psnr, meta.get("psnr_unclamped"), f"white ({rule})")
+    return Stated(psnr, meta["psnr_unclamped"], f"white ({rule})")
 
 
 def frame_errors(errors: Callable[[float], float], white: float) -> tuple[tuple[float, float], ...]:

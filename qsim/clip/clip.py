@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from qsim import colour as pictures
 from qsim import files
@@ -117,13 +116,3 @@ class Clip(ClipFolder):
                 problems.append(files.wording(error))
             report(done, total)
         return problems
-
-    def unsealed(self) -> list[Path]:
-        """Return descriptions (clip, streams) that lack a checksum of themselves: an earlier version wrote them."""
-        found = [] if "checksum" in self.meta else [self.path / "clip.json"]
-        for path in sorted((self.path / "streams").glob("*.json")):
-            try:
-                found += [] if "checksum" in files.read_json(path) else [path]
-            except (ValueError, OSError):  # `verify` reports it
-                continue
-        return found

@@ -34,7 +34,7 @@ from qsim.sensor.defects.event_simulation import Effects, IncidentLight
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD, PlaneByPlane
+from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
 
 LAWS = ("table", "process", "planes", "closed form", "events", "spikes")  # of `Draw.law`
@@ -81,7 +81,7 @@ class Draw:
         if not isinstance(self.sensor, BinarySPAD):
             return "closed form"
         disturbed = self.defects is not None and (self.defects.afterpulse or self.defects.crosstalk)
-        return "planes" if few or self.sums or disturbed or isinstance(self.sensor, PlaneByPlane) else "process"
+        return "planes" if few or self.sums or disturbed else "process"
 
     def light(self, clip: ClipFolder, start: int, stop: int) -> Array:
         """Return expected photons [stop - start, H, W] of clip frames, per clip frame, each row at its time."""
@@ -281,22 +281,16 @@ class Draw:
 
 
 def stored(stream: Stream) -> Draw:
-    """Return the draw of a stored stream, from its json, by the law of its version.
-
-    `ValueError` for an imported stream, or for a law of a later version.
-    """
+    """Return the draw of a stored stream, from its json; `ValueError` for an imported stream."""
     meta = stream.meta
-    for name in ("seed", "clip_key", "ppp", "mean_photons_before", "ppp_factor"):
+    for name in ("seed", "clip_key", "ppp", "mean_photons_before", "ppp_factor", "drawn_by"):
         if meta.get(name) is None:
             raise ValueError(f"{stream.path}: its description holds no {name}: it was not drawn from a clip by qsim")
-    planes, law = int(meta.get("planes_per_code") or 1), meta.get("drawn_by")
-    if law not in (None, *LAWS):
-        raise ValueError(
-            f"{stream.path}: drawn by {law!r}; this version has {', '.join(LAWS)}: use the version that drew it"
-        )
+    planes = int(meta.get("planes_per_code") or 1)
+    law = meta["drawn_by"]
+    if law not in LAWS:
+        raise ValueError(f"{stream.path}: drawn by {law!r}, which is none of {', '.join(LAWS)}; sense it again")
     sensor = stream.sensor
-    if law in (None, "planes") and isinstance(sensor, BinarySPAD):
-        sensor = PlaneByPlane(**vars(sensor))
     level = LightLevel(stream.photons_factor, meta["ppp"] / planes, meta["mean_photons_before"] / planes, None)
     key = Key(seed=meta["seed"], clip=meta["clip_key"])
     where = f"{stream.path.with_suffix('.json')}: defects"
@@ -314,7 +308,7 @@ def same_settings(old: dict[str, Any], new: dict[str, Any]) -> bool:
     """
     old, new = _without_folders(old), _without_folders(new)
     new.pop("dead_time_effects", None)
-    same = all(old.get(key, value if key == "drawn_by" else None) == value for key, value in new.items())
+    same = all(old.get(key) == value for key, value in new.items())
     return same and all(old.get(key) == new.get(key) for key in ("defects", "rows", "colour", "exposures", "origin"))
 
 

@@ -188,7 +188,7 @@ class Stream:
 
     @property
     def origin(self) -> tuple[int, int]:
-        """(y, x) of the first pixel in the full frame; earlier versions drew every crop as one at (0, 0)."""
+        """(y, x) of the first pixel in the full frame."""
         y, x = self.meta.get("origin") or (0, 0)
         return y, x
 
@@ -281,10 +281,6 @@ class Stream:
         except ValueError as error:  # replaced meanwhile
             return [str(error)]
         return problems
-
-    def unsealed(self) -> list[Path]:
-        """Return the description if it lacks a checksum of itself: an earlier version wrote it."""
-        return [] if "checksum" in self.meta else [self.path.with_suffix(".json")]
 
 
 def orientation(meta: dict[str, Any]) -> str:

@@ -61,8 +61,8 @@ class ClipWriter:
                 done = self._finished_meta()["shape"][0] if self._complete else len(_read_journal(self.part))
                 if done and not self.force:
                     raise ValueError(
-                        f"{self.part}: {done} frames exist, begun with other settings, another scene or an earlier "
-                        "version; repeat those to resume, name another with -o, or use --force to start again"
+                        f"{self.part}: {done} frames exist, begun with other settings, or another scene; "
+                        "repeat those to resume, name another with -o, or use --force to start again"
                     )
                 self._clear()
                 self._complete = False

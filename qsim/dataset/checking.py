@@ -1,7 +1,6 @@
 """Compares data sets, clips, streams and restored video with their checksums.
 
-A description holds the checksum of its keys, the checksums of its frames or codes, or both. Descriptions of earlier
-versions hold none of their keys: those that no other file covers are counted and reported as unchecked.
+A description holds the checksum of its keys, and the checksums of its frames or codes.
 """
 
 from __future__ import annotations
@@ -20,30 +19,19 @@ from qsim.dataset.dataset import Dataset
 from qsim.files import Progress, load_array
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """The problems below a path, and the descriptions that no checksum covers."""
-
-    problems: list[str]
-    unsealed: list[Path]
-
-    def lines(self, names: str) -> list[str]:
-        """Return one line per problem, or one that reports none, and a line for what could not be checked."""
-        lines = self.problems or [f"{names}: every file is what was written"]
-        if self.unsealed:
-            count = f"{len(self.unsealed)} description{'s' if len(self.unsealed) > 1 else ''}"
-            lines = [*lines, f"not checked: {count} without a checksum, of an earlier version, as {self.unsealed[0]}"]
-        return lines
+def lines(problems: list[str], names: str) -> list[str]:
+    """Return one line per problem, or one that reports none."""
+    return problems or [f"{names}: every file is what was written"]
 
 
-def check(path: Path, progress: Progress | None = None) -> Verdict:
-    """Compare every file below a data set, a clip, a stream or a restored video with its checksum.
+def check(path: Path, progress: Progress | None = None) -> list[str]:
+    """Compare every file below a data set, a clip, a stream or a restored video with its checksum; return problems.
 
     `FileNotFoundError` or `ValueError` if the path is none of them. `progress` is called with (done, total).
     """
     if (path / "dataset.json").is_file() or (path / "jobs").is_dir():
         dataset = Dataset.open(path)
-        return Verdict(dataset.verify(progress), dataset.unsealed())
+        return dataset.verify(progress)
     if (path / "clip.json").is_file() or not path.with_suffix(".json").is_file():
         return _checked(lambda: Clip.open(path), path / "clip.json", progress)
     description = path.with_suffix(".json")
@@ -80,22 +68,17 @@ class Restored:
         return array
 
     def verify(self, progress: Progress | None = None) -> list[str]:
-        """Return the problems of the two files; a video without a checksum (earlier versions) must only exist."""
-        if "sha256" in self.meta or not self.path.is_file():
-            return files.differs(self.path, self.meta.get("sha256"))
-        return []
-
-    def unsealed(self) -> list[Path]:
-        """Return the description if its checksum or that of the video is missing."""
-        return [] if {"checksum", "sha256"} <= self.meta.keys() else [self.path.with_suffix(".json")]
+        """Return the problems of the video's file."""
+        return files.differs(self.path, self.meta.get("sha256"))
 
 
-def _checked(open_it: Any, description: Path, progress: Progress | None) -> Verdict:
-    """Return the verdict on one object; a damaged description is a problem, a missing one an error."""
+def _checked(open_it: Any, description: Path, progress: Progress | None) -> list[str]:
+    """Return the problems of one object; a damaged description is a problem, a missing one an error."""
     try:
         opened = open_it()
     except ValueError as error:
         if not description.is_file():
             raise
-        return Verdict([str(error)], [])
-    return Verdict(opened.verify(progress), opened.unsealed())
+        return [str(error)]
+    problems: list[str] = opened.verify(progress)
+    return problems

@@ -100,29 +100,12 @@ class Dataset:
         `progress(done, total)` is called after each clip.
         """
         problems = [f"{self.path / 'clips' / name}: not made yet; run `qsim generate` again" for name in self.missing]
-        if "checksum" not in self.meta:
-            problems.append(
-                f"{self.path / 'dataset.json'}: holds no checksum; `qsim generate --repair` writes it again"
-            )
         names = self.names()
         for done, name in enumerate(names, 1):
             problems += verify_job(self.path, name, self.meta["jobs"][name])
             if progress is not None:
                 progress(done, len(names))
         return problems + self.shared_between_splits()
-
-    def unsealed(self) -> list[Path]:
-        """Return the descriptions of clips and streams whose content no checksum covers, their own or a record's."""
-        found = []
-        for name in self.names():
-            try:
-                clip = Clip.open(self.path / "clips" / name)
-                record = _read_record(record_path(self.path, name))
-            except (ValueError, OSError):  # `verify` names the problem
-                continue
-            vouched = {clip.path / "streams" / f"{stream}.json" for stream in record["streams"]}
-            found += [path for path in clip.unsealed() if path not in vouched | {clip.path / "clip.json"}]
-        return found
 
     def shared_between_splits(self) -> list[str]:
         """Return one line per scene, mesh, texture and file of the test split that another split holds too.

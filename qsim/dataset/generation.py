@@ -198,8 +198,6 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
     for job in recipe.jobs:
         if job.name not in old:
             raise ValueError(f"{folder}: was made from another recipe, without the clip {job.name}; use another folder")
-        if old[job.name]["digest"] == job.digest_with():
-            raise ValueError(_of_earlier_version(folder))
         if old[job.name]["digest"] != job.digest and _is_made(folder, job):
             raise ValueError(f"{folder}: its clip {job.name} was made with other settings; use another folder")
     extra = sorted(set(old) - {job.name for job in recipe.jobs})
@@ -215,19 +213,8 @@ def _is_made(folder: Path, job: Job) -> bool:
     return record_path(folder, job.name).is_file() or any((folder / at / job.name).exists() for at in ("clips", "work"))
 
 
-def _of_earlier_version(folder: Path) -> str:
-    """Return the error for a folder whose psnr has another unit."""
-    return (
-        f"{folder}: was begun by an earlier version, whose psnr meant dB below the 99.9th percentile; now it "
-        "is dB below white, and one data set holds one kind: finish it with that version, or use another folder"
-    )
-
-
 def _check_reads(recipe: Recipe, folder: Path) -> None:
-    """`ValueError` if a file that a scene of the user reads has changed since a clip was rendered.
-
-    Clips of earlier versions do not list these files: for them the digest of the job covers the scene's file alone.
-    """
+    """`ValueError` if a file that a scene of the user reads has changed since a clip was rendered."""
     from qsim.dataset import scene_files
 
     seen: set[tuple[str, str, str]] = set()
@@ -260,8 +247,6 @@ def _check_records(recipe: Recipe, folder: Path, repair: bool) -> None:
         with contextlib.suppress(ValueError):
             digests[path.stem] = files.read_json(path).get("digest")
     asked = [job for job in recipe.jobs if job.name in digests]
-    if any(digests[job.name] == job.digest_with() for job in asked):
-        raise ValueError(_of_earlier_version(folder))
     if digests and not any(digests[job.name] == job.digest for job in asked):
         raise ValueError(f"{folder}: none of its {len(digests)} finished clips is of this recipe; use another folder")
     other = [job.name for job in asked if isinstance(digests[job.name], str) and digests[job.name] != job.digest]

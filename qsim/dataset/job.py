@@ -7,6 +7,7 @@ import functools
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from qsim import files
 from qsim.clip.sensing import Sensing
@@ -57,40 +58,30 @@ class Job:
     @property
     def digest(self) -> str:
         """Return the SHA-256 of everything that decides the job's files."""
-        return self.digest_with(psnr_unit="below white")
-
-    def digest_with(self, **more: str) -> str:
-        """Return the digest with more keys.
-
-        Without any, it is the digest of earlier versions, whose psnr was in dB below the 99.9th percentile.
-        """
         described = dataclasses.asdict(self) | {"family": Path(self.family).stem}
-        described["streams"] = [
-            stream | {key: Path(stream[key]).name for key in ("sensor", "colour") if isinstance(stream[key], str)}
-            for stream in described["streams"]
-        ]
-        described["settings"] = {
-            key: value
-            for key, value in described["settings"].items()
-            if key != "camera_path" and (key, value) not in (("bands", None), ("reuse", None))
-        }
-        for stream in described["streams"]:  # options that are off stay out: data sets of earlier versions resume
-            for key, off in (
-                ("defects", None),
-                ("slices", 1),
-                ("follow", False),
-                ("rows", None),
-                ("colour", None),
-                ("exposures", None),
-            ):
-                if stream[key] == off:
-                    del stream[key]
+        described["settings"] = _differing(self.settings)
+        described["settings"].pop("camera_path", None)  # the content of the file decides, see below
+        described["streams"] = [_differing(stream) for stream in self.streams]
+        for stream in described["streams"]:
+            for key in ("sensor", "colour"):
+                if isinstance(stream.get(key), str):
+                    stream[key] = Path(stream[key]).name
         named = (self.family, self.settings.camera_path or "", *(stream.sensor_name for stream in self.streams))
         own = [path for path in named if Path(path).is_absolute()]
         own += [path for stream in self.streams for path in _read_by(stream)]
         if own:  # the content of a file decides, not its name
             described["own"] = [_contents(path) for path in own]
-        return hashlib.sha256(to_json(described | more)).hexdigest()
+        return hashlib.sha256(to_json(described)).hexdigest()
+
+
+def _differing(record: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass that differ from their defaults: a setting that is off changes no digest."""
+    values = dataclasses.asdict(record)
+    return {
+        field.name: values[field.name]
+        for field in dataclasses.fields(record)
+        if getattr(record, field.name) != field.default
+    }
 
 
 State = tuple[tuple[str, tuple[int, ...]], ...]  # of files: name and what changes with the content

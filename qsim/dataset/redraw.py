@@ -73,7 +73,7 @@ def _redrawn(place: Path, json_path: Path, dataset: Path | None) -> Redrawn:
         stream = Stream.open(json_path)
         draw, clip = dataclasses.replace(stored(stream), engine="reference"), Clip.open(place)
         frames, height, width = stream.shape
-        found = Redrawn(path, frames * height * width, cure=_cure(stream, dataset))
+        found = Redrawn(path, frames * height * width, cure=_cure(dataset))
         step = max(1, _BLOCK_PIXELS // (height * width * draw.planes))
         start = 0
         for block in draw.blocks(clip, 0, frames, step):
@@ -87,14 +87,11 @@ def _redrawn(place: Path, json_path: Path, dataset: Path | None) -> Redrawn:
     return found
 
 
-def _cure(stream: Stream, dataset: Path | None) -> str:
+def _cure(dataset: Path | None) -> str:
     """Return what to do about wrong codes, so that `check` passes afterwards."""
     if dataset is None:
         return "sense it again with --force"
-    if "drawn_by" in stream.meta:
-        return f"delete the file and run `qsim generate RECIPE -o {dataset} --repair`"
-    # `generate` does not resume data sets of the versions with another psnr
-    return f"the right one: `qsim sense {dataset} --name NEW` with its settings, or generate all in another folder"
+    return f"delete the file and run `qsim generate RECIPE -o {dataset} --repair`"
 
 
 def _streams(path: Path) -> list[tuple[Path, Path, Path | None]]:

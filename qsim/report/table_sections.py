@@ -158,12 +158,7 @@ def _winner(lines: list[dict[str, Any]], plan: dict[str, Any]) -> str:
 
 
 def _definition(found: dict[str, Any]) -> str:
-    """Return the definition of the scores of an evaluation, which changed with format 2."""
-    if "peak" not in found:
-        return (
-            "scores of the earlier definition (peak = the sensor's white, matched = after the factor of least "
-            "squares without the clamp); they cannot be compared with later ones"
-        )
+    """Return the definition of the scores of an evaluation."""
     unit = "window" if found.get("plan", {}).get("published") else "clip"
     return (
         f"peak = {found['peak']}; matched = after the one factor per {unit} that is best behind the clamp at the peak"
@@ -201,7 +196,7 @@ def static_section(path: Path) -> page.Section:
     caption = (
         f"{Path(found['counts']).name}: real photons clipped to {found['bits']} bits, restored from {found['frames']} "
         "frames, scored against the others; the variance of the reference is subtracted; "
-        + (f"peak = {found['peak']:.4g} photons" if "peak" in found else "peak = the largest code (earlier definition)")
+        f"peak = {found['peak']:.4g} photons"
     )
     return page.section("Real photons", page.table(page.Table(caption, headers, rows)))
 
@@ -235,7 +230,7 @@ def study_section(path: Path) -> page.Section:
     found = files.read_json(path)
     rows = found.get("rows") or found.get("cells") or []
     if path.stem.startswith("figure"):
-        rows = [{"clip": row["clip"]} | _panel_row(panel) for row in rows for panel in row["panels"]]
+        rows = [{"clip": row["clip"]} | panel for row in rows for panel in row["panels"]]
     words = {key: value for key, value in found.items() if isinstance(value, int | float | str)}
     keys = list(dict.fromkeys(key for row in rows for key in row if not isinstance(row[key], list | dict)))
     table = page.table(page.Table(f"{len(rows)} rows", [_heading(key) for key in keys],
@@ -246,11 +241,6 @@ def study_section(path: Path) -> page.Section:
     figure = page.stored_figure(picture.read_bytes(), name) if picture.is_file() else None
     story = next((str(text) for text in (found.get("answer"), *found.get("answers", [])) if text), "")
     return page.section(f"Study: {path.parent.name}", page.bullets(lines), figure, table, story=story)
-
-
-def _panel_row(panel: dict[str, Any]) -> dict[str, Any]:
-    """Return a panel of a figure; earlier versions stored its blur, a share of the peak, as `blur_error`."""
-    return {"blur_over_peak" if key == "blur_error" else key: value for key, value in panel.items()}
 
 
 def bench_section(path: Path) -> page.Section:

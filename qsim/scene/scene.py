@@ -233,7 +233,7 @@ def describe(value: Any) -> Any:
 
 
 def _is_told(record: Any, field: dataclasses.Field[Any]) -> bool:
-    """Return whether a description holds a field: not where it is marked "if any" and None, as in earlier versions."""
+    """Return whether a description holds a field: not where it is marked "if any" and None."""
     return "described" not in field.metadata or getattr(record, field.name) is not None
 
 

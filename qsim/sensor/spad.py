@@ -176,14 +176,6 @@ class BinarySPAD(SPAD):
         return np.sum([single.draw_at(photons / m, exposure / m, key=key, at=plane) for plane in planes], axis=0)
 
 
-@dataclass(frozen=True)
-class PlaneByPlane(BinarySPAD):
-    """A clocked pixel of streams without `drawn_by`: planes one by one at any number of bits."""
-
-    def _draw_frame(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
-        return self._draw_planes(photons, exposure, key, origin)
-
-
 def _log_binomials(n: int) -> Array:
     """Return log C(n, k), k = 0 ... n."""
     from scipy.special import gammaln

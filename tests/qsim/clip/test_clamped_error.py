@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
 import pytest
-from clips import write_clip
 from stats import critical_z
 
 from qsim.clip.clamped_error import (
@@ -22,9 +20,7 @@ from qsim.clip.clamped_error import (
     white_in,
     white_of,
 )
-from qsim.clip.clip import Clip
 from qsim.optics.radiometry import WHITE_PER_MEAN
-from qsim.report import report
 
 SIZE = 200  # px, sides of the noise images
 
@@ -136,15 +132,3 @@ def test_chance_in_an_estimate_falls_by_the_root_of_three(count):
     errors = np.sqrt(np.mean(rng.standard_normal((1200, count)) ** 2, axis=1))
     found = np.square(over_neighbours(errors, np.ones(1200)))[2:-1:4]
     assert np.var(found) == pytest.approx(2 / count / 3, rel=critical_z() * math.sqrt(2 / len(found)))
-
-
-def test_a_clip_of_an_earlier_version_is_named_in_its_own_unit(tmp_path):
-    clip = write_clip(tmp_path / "old", frames=3, height=12, width=16)
-    meta = json.loads((clip.path / "clip.json").read_text())
-    for key in ("white", "error_at_white_per_frame", "psnr_unclamped", "checksum"):
-        meta.pop(key)
-    (clip.path / "clip.json").write_text(json.dumps(meta | {"psnr_of_truth": 38.25}))
-    found = stated(Clip.open(clip.path).meta)
-    assert found.line == "38.2 dB below the 99.9th percentile (a clip of an earlier version)"
-    assert found.line in report.build_page(clip.path)
-    assert stated({"mean_radiance": 1.0}) is None

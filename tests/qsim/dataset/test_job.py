@@ -1,30 +1,17 @@
-"""Digests of jobs: those of earlier versions, and the files that streams read."""
+"""Digests of jobs: settings that are off, and the files that streams read."""
 
 from __future__ import annotations
 
+import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from clips import write_dataset
 
+from qsim.clip.sensing import Sensing
 from qsim.dataset import recipe
-from qsim.dataset.dataset import Dataset
-from qsim.dataset.job import Job
-
-
-def test_a_data_set_of_the_earlier_unit_is_not_mixed_with_the_new_one(tmp_path, monkeypatch):
-    with monkeypatch.context() as earlier:
-        earlier.setattr(Job, "digest", property(Job.digest_with))
-        folder = write_dataset(tmp_path / "set", {"train": 2})
-    (folder / "jobs" / "train_0.json").unlink()
-    with pytest.raises(ValueError, match=r"below the 99\.9th percentile; now it is dB below white"):
-        write_dataset(folder, {"train": 2})
-    assert len(Dataset.open(folder).clips()) >= 1  # it stays readable
-    (folder / "dataset.json").unlink()  # killed before its end: only the records show its recipe
-    with pytest.raises(ValueError, match="was begun by an earlier version, whose psnr meant"):
-        write_dataset(folder, {"train": 2})
-
+from qsim.dataset.job import Job, Settings
 
 FILTERS = '[colour]\nmask = "rggb"\nefficiency.R = 0.4\nefficiency.G = 0.6\nefficiency.B = 0.5\n'
 MAPPED = """[sensor]
@@ -61,3 +48,21 @@ def test_filters_and_measured_maps_decide_the_digest_and_their_folder_does_not(t
     edited = job_in(tmp_path / "a", kind, 0.3)
     assert edited.digest != before
     assert edited.digest == job_in(tmp_path / "b", kind, 0.3).digest
+
+
+def test_a_setting_that_is_off_changes_no_digest():
+    """Not even one that does not exist yet: a record with one more field of any default has the same digest."""
+    settings = Settings(frames=3, height=8, width=9, frame_rate=2000.0)
+    stream = Sensing("quiver-physical", bits=3, ppp=3.25)
+    job = Job("a", "fan", 1, 1.0, "train", settings, 7, (stream,))
+    for record, name in ((settings, "settings"), (stream, "streams")):
+        kind = type(record)
+        for added in (None, False, 1, 0.0):
+            wider = dataclasses.make_dataclass("Wider", [("later", object, added)], bases=(kind,), frozen=True)
+            values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+            other = wider(**values)
+            assert replace(job, **{name: (other,) if name == "streams" else other}).digest == job.digest
+    for changed in (replace(settings, psnr=41.0), replace(settings, bands="rgb"), replace(settings, reuse=False)):
+        assert replace(job, settings=changed).digest != job.digest
+    for changed in (replace(stream, bits=2), replace(stream, slices=2), replace(stream, follow=True)):
+        assert replace(job, streams=(changed,)).digest != job.digest

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from clips import square_clip
 
+from qsim import files
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
@@ -46,13 +47,13 @@ def folder(tmp_path_factory):
         "source": str(stream.path),
     }
     np.save(top / "video.npy", np.full(clip.shape, 3.25, np.float32))
-    (top / "video.json").write_text(json.dumps(restored))
+    files.write_description(top / "video.json", restored)
     entry = {"step": 10, "elapsed": 60.0, "psnr_matched": 21.5}
     (top / "history.json").write_text(json.dumps({"settings": {}, "history": [entry, entry | {"elapsed": 120.0}]}))
     interval = {"mean": 20.0, "half_width": 1.0, "scenes": 2}
     line = {"method": "<moment>", "light": "3.25 PPP", "seconds_per_frame": 0.1, "truth_psnr": None}
     line["scores"] = {"psnr": interval, "psnr_matched": interval, "ssim_matched": interval | {"half_width": None}}
-    evaluation = {"format": "quiver-evaluation-1", "table": [line]}
+    evaluation = {"format": "quiver-evaluation-2", "peak": "white", "table": [line]}
     (top / "evaluation.json").write_text(json.dumps(evaluation))
     (top / "unknown.json").write_text("[1, 2]")
     return top

@@ -1,6 +1,5 @@
 """Tests the section of a clip: light, motion, codes with their exact distribution, modelled effects, error."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 from clips import colour_clip, square_clip, write_clip
 from stats import mixture_p_value
 
+from qsim import files
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
@@ -166,7 +166,7 @@ def test_numbers_of_the_first_frames_are_not_those_of_the_clip(tmp_path):
     assert f"codes of mine {which} frames: drawn" in body
     about = {"format": "quiver-restored-1", "method": "moment", "seconds_per_frame": 0.1, "source": str(stream.path)}
     np.save(tmp_path / "v.npy", np.full(stream.shape, 3.25, np.float32))
-    (tmp_path / "v.json").write_text(json.dumps(about))
+    files.write_description(tmp_path / "v.json", about)
     section = report.restored_section(tmp_path / "v.json")
     assert section.story.endswith(f"PSNR {which} frames.")
     assert section.facts[0].what == f"PSNR of v {which} frames"

@@ -14,8 +14,6 @@ from qsim.studies.validation.sensors import SensorReport, SensorRow
 
 
 def test_an_evaluation_defines_its_scores(folder):
-    """Before format 2 the peak was the sensor's white and the factor unclamped; a page never mixes the two."""
-    assert "peak = the sensor&#39;s white" in report.build_page(folder, title="All")
     path = folder / "evaluation.json"
     found = json.loads(path.read_text()) | {"peak": "2.5 x the stream's mean light", "remarks": ["<mine> was never"]}
     line = found["table"][0] | {"above_peak": 0.0961, "truth_psnr": 21.0, "near_truth": ["psnr_matched"]}
@@ -29,7 +27,6 @@ def test_an_evaluation_defines_its_scores(folder):
         "&lt;mine&gt; was never",
     ):
         assert words in page, words
-    assert "of the earlier definition" not in page
 
 
 def scored(method: str, light: str, psnr: float | str | None, scenes: int = 3) -> dict:
@@ -139,10 +136,8 @@ def test_headings_have_units(tmp_path):
     assert "3 bits are best." in page.split("</header>")[0]
 
 
-@pytest.mark.parametrize("key", ["blur_over_peak", "blur_error"])
-def test_the_blur_of_a_figure_is_a_share_of_its_peak(tmp_path, key):
-    """Earlier versions stored it as `blur_error`, the name of the blur of a study in photons."""
-    figure = {"figure": 1, "rows": [{"clip": "fan", "panels": [{"label": "CMOS 60 fps", key: 0.03}]}]}
+def test_the_blur_of_a_figure_is_a_share_of_its_peak(tmp_path):
+    figure = {"figure": 1, "rows": [{"clip": "fan", "panels": [{"label": "CMOS 60 fps", "blur_over_peak": 0.03}]}]}
     (tmp_path / "figure1.json").write_text(json.dumps(figure))
     assert ">blur [of the peak]</th>" in study_section(tmp_path / "figure1.json").body
 
