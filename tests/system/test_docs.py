@@ -230,7 +230,7 @@ def test_relative_links_lead_somewhere():
 
 
 def _load(name):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -255,7 +255,7 @@ def test_files_named_on_the_map_exist():
 def test_the_page_of_evidence_is_made_from_its_numbers():
     numbers = json.loads((ROOT / "docs" / "evidence.json").read_text())
     page = (ROOT / "docs" / "evidence.md").read_text(encoding="utf-8")
-    assert page == _load("evidence").page(numbers), "run `python docs/evidence.py --page-only`"
+    assert page == _load("evidence").page(numbers), "run `python benchmarks/evidence.py --page-only`"
     numbers["sensor"]["report"]["ok"] = False
     assert "outside its bounds" in _load("evidence").page(numbers)
     numbers["reading"]["report"] = ReadingReport(250.0, 20.0, 300.0, 9.0, 0.3).to_dict()

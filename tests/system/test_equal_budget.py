@@ -19,7 +19,7 @@ from quiver.model.presets import ABLATIONS, build, parameter_count
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "support"))
 
-sys.path.insert(0, str(ROOT / "docs"))
+sys.path.insert(0, str(ROOT / "benchmarks"))
 import ablation_rows  # noqa: E402
 import equal_budget  # noqa: E402
 import equal_steps  # noqa: E402
@@ -29,7 +29,7 @@ from step_rows import Steps, together  # noqa: E402
 
 
 def run(*words: object, program: str = "equal_budget") -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(ROOT / "docs" / f"{program}.py"), *map(str, words)]
+    command = [sys.executable, str(ROOT / "benchmarks" / f"{program}.py"), *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
 
 
@@ -306,7 +306,7 @@ def test_rows_of_the_ablation_are_made_once_and_shown(tmp_path, length):
     assert table.count("±") == 2
     if length:
         assert "| 2, 2 |" in table
-        assert "`python docs/ablation_rows.py out/starter --steps 2`" in table
+        assert "`python benchmarks/ablation_rows.py out/starter --steps 2`" in table
         other = run(*words[:-1], 3, program="ablation_rows")
         assert (other.returncode, other.stdout) == (2, "")
         assert "was made with budget" in other.stderr
@@ -365,7 +365,7 @@ def test_rows_of_equal_steps_are_made_once_and_shown(tmp_path):
     table = out.with_suffix(".md").read_text()
     score = row["scores"]["3.25 PPP, 3 bit"]["scores"]["psnr_matched"]
     assert rows.interval(score, 2) in next(line for line in table.split("\n") if "| unet |" in line)
-    assert "`python docs/equal_steps.py out/starter --steps 6`: steps of 2 windows" in table
+    assert "`python benchmarks/equal_steps.py out/starter --steps 6`: steps of 2 windows" in table
     other = run(*words[:-1], 7, program="equal_steps")
     assert (other.returncode, other.stdout) == (2, "")
     assert "was made with budget" in other.stderr

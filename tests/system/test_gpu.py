@@ -1,4 +1,4 @@
-"""docs/gpu.py: pieces, resuming, failures and mistakes with faked measurements; the true ones, tiny, are slow."""
+"""benchmarks/gpu.py: pieces, resuming, failures and mistakes with faked measurements; the true ones, tiny, are slow."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 import torch
 
 ROOT = Path(__file__).parents[2]
-PARTS = ROOT / "docs" / "gpu"
+PARTS = ROOT / "benchmarks" / "gpu"
 
 # Runs the true child.py with faked sections. What each measurement does stands in acts.json: {"SECTION.NAME": act}.
 FAKE = """
@@ -107,7 +107,9 @@ def told(capsys) -> str:
 
 
 def test_importing_the_program_runs_nothing():
-    code = "import runpy; found = runpy.run_path('docs/gpu.py', run_name='gpu'); print(sorted(set(found) & {'main'}))"
+    code = (
+        "import runpy; found = runpy.run_path('benchmarks/gpu.py', run_name='gpu');print(sorted(set(found) & {'main'}))"
+    )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -141,7 +143,7 @@ def test_what_is_measured_is_not_measured_again(bench, capsys):
     assert bench.made() == []
     table = json.loads((bench.out / "table.json").read_text())
     assert table["records"]["train"]["one"]["rows"][0]["name"] == "one"
-    assert table["records"]["train"]["one"]["command"] == "python docs/gpu.py OUT --minutes 9"
+    assert table["records"]["train"]["one"]["command"] == "python benchmarks/gpu.py OUT --minutes 9"
     assert "## restore" in (bench.out / "table.md").read_text()
 
 
@@ -468,7 +470,7 @@ def test_a_folder_without_wheels_is_refused(bench, tmp_path, capsys):
 def test_the_table_leaves_out_what_it_cannot_read(bench):
     import table
 
-    kept = {"state": "done", "setup": {"program": "1f"}, "command": "python docs/gpu.py OUT", "minutes": 9}
+    kept = {"state": "done", "setup": {"program": "1f"}, "command": "python benchmarks/gpu.py OUT", "minutes": 9}
     page = "\n".join(
         table.page(
             {"gpus": ["NVIDIA H200"], "cores": 2},
@@ -508,7 +510,7 @@ sys.meta_path.insert(0, Hidden())
 )
 def test_without_a_package_the_true_measurements_name_it(tmp_path, hidden, section, name):
     (tmp_path / "sitecustomize.py").write_text(HIDE.format(hidden={hidden}))
-    command = [sys.executable, "docs/gpu.py", str(tmp_path / "out"), "--section", section, "--minutes", "1"]
+    command = [sys.executable, "benchmarks/gpu.py", str(tmp_path / "out"), "--section", section, "--minutes", "1"]
     path = os.environ | {"PYTHONPATH": str(tmp_path)}
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=path, check=False)
     record = json.loads((tmp_path / "out" / section / f"{name}.json").read_text())

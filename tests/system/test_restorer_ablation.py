@@ -12,7 +12,7 @@ import torch
 from clips import write_dataset
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "docs"))
+sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import restorer_ablation as ablation  # noqa: E402  (docs are not a package)
 

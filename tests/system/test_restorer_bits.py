@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from stats import assert_mean
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import restorer_bits
 

@@ -11,7 +11,7 @@ from clips import write_dataset
 from PIL import Image
 from stats import critical_z
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import restorer_checks
 

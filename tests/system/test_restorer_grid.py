@@ -12,7 +12,7 @@ import pytest
 from clips import write_dataset
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "docs"))
+sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import restorer_grid  # noqa: E402  (docs are not a package)
 
@@ -137,7 +137,15 @@ def test_only_what_is_missing_is_measured(tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_the_program_measures_a_cell_with_all_methods(tmp_path):
     write_dataset(tmp_path / "data", {"test": 1})
-    words = [sys.executable, "docs/restorer_grid.py", str(tmp_path / "data"), "--cells", "spad-7-4.9", "--frames", "1"]
+    words = [
+        sys.executable,
+        "benchmarks/restorer_grid.py",
+        str(tmp_path / "data"),
+        "--cells",
+        "spad-7-4.9",
+        "--frames",
+        "1",
+    ]
     done = subprocess.run([*words, "--out", str(tmp_path / "g")], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "| spad-7-4.9 |" in (tmp_path / "g.md").read_text()

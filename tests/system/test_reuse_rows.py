@@ -11,7 +11,7 @@ import pytest
 from stats import critical_z
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "docs"))
+sys.path.insert(0, str(ROOT / "benchmarks"))
 import reuse_rows  # noqa: E402
 
 SIZE = (64, 80)  # px

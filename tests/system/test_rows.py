@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "docs"))
+sys.path.insert(0, str(ROOT / "benchmarks"))
 import ablation_rows  # noqa: E402
 import clip_rows  # noqa: E402
 import cycles_rows  # noqa: E402

@@ -23,7 +23,7 @@ from qsim.optics.camera import Camera
 from qsim.scene import describe
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "docs"))
+sys.path.insert(0, str(ROOT / "benchmarks"))
 import shard_contents  # noqa: E402  (docs are not a package)
 import shard_cost  # noqa: E402
 import shard_page  # noqa: E402
@@ -95,15 +95,6 @@ def plan(place: Path, capsys, name: str, *words: str) -> Path:
     return path
 
 
-def earlier(place: Path, **other: object) -> Path:
-    """Store a plan as commit 5c22140 writes it."""
-    kinds = [{"family": "fan", "clips": 3}, {"family": "drums", "clips": 3}]
-    totals = {"processor_hours": 20.5, "hours": 11.0, "gigabytes": 7.0, "peak_memory_gib": 2.0, "engine": "llvm"}
-    path = place / "plan-earlier.json"
-    path.write_text(json.dumps({**totals, "kinds": kinds, **other}))
-    return path
-
-
 def run(place: Path, *words: object) -> int:
     line = ["--recipe", place / "tiny.toml", "--shard", "1/3", "--out", place / "out" / "tiny", *words]
     return shard_cost.main(list(map(str, line)))
@@ -164,7 +155,6 @@ def test_a_plan_alone_makes_a_page_that_names_what_is_missing(place, capsys):
     text = (place / "out" / "tiny.md").read_text()
     assert "| hours | 12 |" in text
     assert "The plan with frames that share samples is not measured yet." in text
-    assert "The plan by commit 5c22140 is not measured yet." in text
     assert "The shard itself is not measured yet." in text
     assert "reached" not in text
     assert not (place / "out" / "tiny.png").exists()
@@ -199,27 +189,9 @@ def test_the_page_compares_planned_and_used(place, capsys):
 def test_the_stored_page_is_made_from_its_numbers():
     results = ROOT / "docs" / "results"
     found = json.loads((results / "i2.json").read_text())
-    assert (results / "i2.md").read_text(encoding="utf-8") == shard_page.page(found, "i2.png"), "run docs/shard_cost.py"
-
-
-def test_a_plan_of_the_earlier_program_stands_beside_ours(place, capsys):
-    assert run(place, "--alone", plan(place, capsys, "tiny"), "--earlier", earlier(place)) == 0
-    text = (place / "out" / "tiny.md").read_text()
-    assert "|  | each frame alone | commit 5c22140 |" in text
-    assert "| hours | 12 | 20.5 |" in text
-    assert "The plan by commit" not in text
-
-
-@pytest.mark.parametrize(
-    ("other", "said"),
-    [
-        ({"kinds": [{"family": "fan", "clips": 6}]}, "is not the plan that commit 5c22140 makes of tiny"),
-        ({"digest": "0"}, "is not the plan that commit 5c22140 makes of tiny"),
-        ({"kinds": [{"family": "fan"}]}, "lacks 'clips'; make it again by commit 5c22140"),
-    ],
-)
-def test_another_plan_is_not_taken_for_the_earlier_one(place, capsys, other, said):
-    assert said in refused(place, capsys, "--earlier", earlier(place, **other))
+    assert (results / "i2.md").read_text(encoding="utf-8") == shard_page.page(found, "i2.png"), (
+        "run benchmarks/shard_cost.py"
+    )
 
 
 @pytest.mark.slow

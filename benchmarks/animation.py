@@ -1,6 +1,6 @@
 """Makes the animated picture of the README: one clip, seen and restored in six ways, with the PSNR of each.
 
-python docs/animation.py docs/pictures/demo.webp     # about three minutes of processor time
+python benchmarks/animation.py docs/pictures/demo.webp     # about three minutes of processor time
 
 A scene of the family `text` is rendered and sensed at 3.25 photons per pixel with 1 bit and with 3 bits. `mergenet` was
 trained on photographs and on rendered scenes of other families. All panels show photons on one tone curve. PSNR is that

@@ -1,6 +1,6 @@
 """Measures the time per pixel [us] that the reference engine takes for random sensors of every model.
 
-    python docs/costs.py 300               # so many sensors of each model, on one core
+    python benchmarks/costs.py 300               # so many sensors of each model, on one core
 
 Each draws a block of 16 384 pixels at four kinds of light: 0 to 20 photons, up to 1.5 white, 1e6 photons, and 1e-3 to
 1e6 photons. The result is the median of three draws, after a first one that computes tables.

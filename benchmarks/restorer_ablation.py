@@ -1,8 +1,8 @@
 """Measures what each idea of mergenet brings: the same training without it, equal steps, two seeds, one row each.
 
-    python docs/restorer_ablation.py out/photos out/restorer out/restorer_test                 # rows that are missing
-    python docs/restorer_ablation.py out/photos out/restorer out/restorer_test --rows all,adam
-    python docs/restorer_ablation.py out/tiny out/tiny out/tiny --tiny --out out/rows          # seconds: a test of this
+    python benchmarks/restorer_ablation.py out/photos out/restorer out/restorer_test           # rows that are missing
+    python benchmarks/restorer_ablation.py out/photos out/restorer out/restorer_test --rows all,adam
+    python benchmarks/restorer_ablation.py out/tiny out/tiny out/tiny --tiny --out out/rows    # seconds: a test of this
 
 A row is RESULTS/NAME-SEED.json, written when it is complete and made once. Windows are drawn once, into WORK (12 GB),
 and seen three times (STEPS x BATCH / WINDOWS), flipped at random. All rows make equally many steps, so busy cores
@@ -309,7 +309,7 @@ def write_table(out: Path) -> None:
     size = rows[0]["size"]
     levels = [f"{key} PPP" for key in rows[0]["by_light"]]
     text = ["# What each idea of mergenet brings", ""]
-    text += ["Made by `python docs/restorer_ablation.py out/photos out/restorer out/restorer_test`.", ""]
+    text += ["Made by `python benchmarks/restorer_ablation.py out/photos out/restorer out/restorer_test`.", ""]
     text += [f"{size['steps']} steps of {size['batch']} windows of {size['crop']} x {size['crop']} px from "
              f"{size['windows']} windows. Mean PSNR in dB on windows of the test clips, peak 2.5 times the mean light, "
              "1, 3 and 7 bits at 0.5, 3.25 and 26 photons per pixel.", ""]  # fmt: skip

@@ -12,20 +12,21 @@ from qsim.tables import markdown_table
 TARGET = 5.0  # times faster than the cheapest setting of Cycles that reaches the error
 HEAD = """# Beside Blender's Cycles
 
-*Written by `python docs/cycles_rows.py`, which says how. It makes missing rows, and marked ones again.*
+*Written by `python benchmarks/cycles_rows.py`, which says how. It makes missing rows, and marked ones again.*
 
 <!-- not run: needs Blender's bpy in a separate environment, and an hour or two -->
 ```sh
 python3.11 -m venv out/bpy
 out/bpy/bin/pip install bpy==5.0.0 numpy
-python docs/cycles_rows.py --cycles out/bpy/bin/python
+python benchmarks/cycles_rows.py --cycles out/bpy/bin/python
 ```
 
-Both programs render the same clip of {frames} frames, of seed 4, with two threads. `docs/cycles_scene.py` writes it as
-a neutral file. `docs/cycles_render.py` imports nothing of ours and renders that file with Blender 5.0. Lacquered bodies
-are made diffuse, because the programs have different models of lacquer; metals stay metals. Cycles gets our pixel area,
-our number of bounces, no clamp and no adaptive samples. It also gets what makes it cheaper here: a scene that stays
-loaded between frames, no light tree, blue noise, and denoisers faster than its default. It renders three equal colours.
+Both programs render the same clip of {frames} frames, of seed 4, with two threads. `benchmarks/cycles_scene.py` writes
+it as a neutral file. `benchmarks/cycles_render.py` imports nothing of ours and renders that file with Blender 5.0.
+Lacquered bodies are made diffuse, because the programs have different models of lacquer; metals stay metals.
+Cycles gets our pixel area, our number of bounces, no clamp and no adaptive samples. It also gets what makes it
+cheaper here: a scene that stays loaded between frames, no light tree, blue noise, and denoisers faster than its
+default. It renders three equal colours.
 
 Each program is judged by its own converged pictures. **reached** is in dB below white, picture and truth clamped there,
 over several frames. Ours takes a budget that asks for 40 dB. Ours and one setting of Cycles are rendered in turn. **s**

@@ -13,7 +13,6 @@ from qsim.clip.motion_statistics import MOVING
 from qsim.figures import new_figure, write_figure
 from qsim.tables import markdown_table
 
-EARLIER = "5c22140"  # the commit whose plan is beside ours
 WAYS = {"alone": "each frame alone", "reuse": "frames that share samples"}
 SHARE = 1 / 3  # wanted processor hours with reuse, of those without
 WITHIN = (0.7, 1.3)  # wanted processor hours used, of those planned
@@ -21,12 +20,10 @@ MOST_MEMORY = 2.5  # GB of a worker
 
 HEAD = """# A shard of {recipe}: planned, made and measured
 
-*Written by `python docs/shard_cost.py`. The json file beside this page holds all numbers.*
+*Written by `python benchmarks/shard_cost.py`. The json file beside this page holds all numbers.*
 
 `scenes/{recipe}.toml` has {clips} clips. The other recipe below differs from it in one line, `reuse = false`. Shard
 {part} has the clips {names}.
-Commit {earlier} is the program before frames shared samples. Its plan asks for the same number of dB below the 99.9th
-percentile, without a clamp.
 
 <!-- not run: plans of an hour or two, and a shard of up to an hour, on two cores -->
 ```sh
@@ -36,10 +33,8 @@ qsim plan out/alone.toml --json > out/plan_alone.json                           
 qsim plan scenes/{recipe}.toml --json > out/plan.json                       # 20 to 60 minutes
 qsim plan scenes/{recipe}.toml --shard {part} --json > out/plan_shard.json  # 5 to 15 minutes
 qsim generate scenes/{recipe}.toml -o out/i2 --shard {part}                 # 20 to 60 minutes
-mkdir -p out/{earlier} && git archive {earlier} qsim scenes | tar -x -C out/{earlier}
-(cd out/{earlier} && PYTHONPATH=. python -m qsim plan scenes/{recipe}.toml --json > ../plan_earlier.json)
-python docs/shard_cost.py --shard {part} --alone out/plan_alone.json --reuse out/plan.json \\
-    --earlier out/plan_earlier.json --shard-plan out/plan_shard.json --data out/i2  # a minute
+python benchmarks/shard_cost.py --shard {part} --alone out/plan_alone.json --reuse out/plan.json \\
+    --shard-plan out/plan_shard.json --data out/i2  # a minute
 ```
 
 The times are estimates. Hours are of processor time, of all threads, unless they are called wall hours. 1 GB is 10⁹
@@ -51,7 +46,7 @@ MISSING = "not measured yet"
 def page(found: dict[str, Any], figure: str) -> str:
     """Return the page of what was found; `figure` is the name of its figure."""
     names = ", ".join(f"`{name}`" for name in found["shard"])
-    text = [HEAD.format(recipe=found["recipe"], clips=found["clips"], part=found["part"], names=names, earlier=EARLIER)]
+    text = [HEAD.format(recipe=found["recipe"], clips=found["clips"], part=found["part"], names=names)]
     text += ["## Targets", "", *markdown_table(targets(found), ("what", "wanted", "found", "target")), ""]
     text += ["## The whole recipe", "", *whole(found["plans"]), "## The shard", "", *costs(found)]
     shown = light(found["made"]["clips"], figure) if "made" in found else [f"{MISSING.capitalize()}.", ""]
@@ -101,8 +96,6 @@ def whole(plans: dict[str, Any]) -> list[str]:
     keys = {"hours": "processor_hours", "wall hours, one worker": "wall_hours", "GB": "gigabytes"}
     keys["memory of the planning process [GB]"] = "memory"
     columns = {WAYS[way]: plan for way, plan in given.items()}
-    if "earlier" in plans:
-        columns[f"commit {EARLIER}"] = plans["earlier"]
     lines = [(name, *(f"{plan[key]:.3g}" for plan in columns.values())) for name, key in keys.items()]
     text = [*markdown_table(lines, ("", *columns)), ""]
     text += ["Samples per pixel, and neighbours on each side, are the fewest and the most of up to five clips:", ""]
@@ -116,7 +109,6 @@ def whole(plans: dict[str, Any]) -> list[str]:
             cells += [f"{kind['clips'] * kind['processor_hours']:.2f}", span(kind["samples"]), span(kind["neighbours"])]
         rows.append(cells)
     missing = [f"with {WAYS[way]}" for way in WAYS if way not in plans]
-    missing += [] if "earlier" in plans else [f"by commit {EARLIER}"]
     return [*text, *markdown_table(rows, header), "", *(f"The plan {name} is {MISSING}.\n" for name in missing)]
 
 

@@ -1,8 +1,8 @@
 """Repeats the paper's ablation with a QUIVER of a million parameters: six networks, two seeds, one row each.
 
-    python docs/ablation_rows.py out/starter --steps 277           # equal steps, all missing rows at once: on a GPU
-    python docs/ablation_rows.py out/starter --out out/rows        # 20 minutes for each row that is missing
-    python docs/ablation_rows.py out/tiny --tiny --out out/rows    # seconds for each row: a test of this program
+    python benchmarks/ablation_rows.py out/starter --steps 277         # equal steps, all missing rows at once: on a GPU
+    python benchmarks/ablation_rows.py out/starter --out out/rows      # 20 minutes for each row that is missing
+    python benchmarks/ablation_rows.py out/tiny --tiny --out out/rows  # seconds for each row: a test of this program
 
 A row is RESULTS/NAME-SEED.json: one of the six networks of the paper's Table 4, with one seed of weights and windows.
 It is written when it is complete and made once; an interrupted one resumes from WORK. A wider recurrent cell stands for
@@ -49,7 +49,7 @@ from quiver.training.settings import PROTOCOLS, Settings
 FORMAT = "quiver-ablation-1"
 MILLION = Config(channels=4, deformable_groups=4, denoiser_growth=8, flow_channels=(20, 40, 20, 10))
 SEEDS = (0, 1)
-RATE = 3e-4  # the lower one of docs/equal_budget.py: the same for all six
+RATE = 3e-4  # the lower one of benchmarks/equal_budget.py: the same for all six
 LIMITS = """So short a training shows which parts help at once, not which help after days. The spread of two seeds is
 the only measure of chance here: differences within it mean nothing."""
 
@@ -167,7 +167,7 @@ def write_table(out: Path) -> None:
     steps = rows[0]["budget"].get("steps") if rows else None
     text = [
         *("# The paper's ablation with a million parameters", ""),
-        *(f"Made by `python docs/ablation_rows.py out/starter{f' --steps {steps}' if steps else ''}`.", ""),
+        *(f"Made by `python benchmarks/ablation_rows.py out/starter{f' --steps {steps}' if steps else ''}`.", ""),
         *(LIMITS, "", *markdown_table(table, header), "", *notes_on(rows)),
     ]
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())

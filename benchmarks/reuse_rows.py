@@ -1,9 +1,9 @@
 """Measures what sharing samples between frames gains, how honest its stated error is, and how its error flickers.
 
-    python docs/reuse_rows.py                              # nine families at 128 x 256: hours on one core
-    python docs/reuse_rows.py --rows plain,room --busy     # these alone, beside other programs
-    python docs/reuse_rows.py --seed 307                   # other clips of the same families
-    python docs/reuse_rows.py --tiny --out out/rows        # minutes: a test of this program
+    python benchmarks/reuse_rows.py                              # nine families at 128 x 256: hours on one core
+    python benchmarks/reuse_rows.py --rows plain,room --busy     # these alone, beside other programs
+    python benchmarks/reuse_rows.py --seed 307                   # other clips of the same families
+    python benchmarks/reuse_rows.py --tiny --out out/rows        # minutes: a test of this program
 
 A row is RESULTS/FAMILY-SIZE.json. It is written when it is complete, and made once; only missing ones are made. Per
 row: one clip is budgeted at the asked PSNR twice, frames alone and with neighbours. Both budgets render the same frames
@@ -196,9 +196,9 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     text = [
         "# Frames that share samples",
         "",
-        "Made by `python docs/reuse_rows.py`, which says how; rows that end in -s307 with `--seed 307`. Processor",
-        "seconds per frame at equal asked PSNR, frames alone and with neighbours; decibels below white. A frame states",
-        "the error that clip.json has.",
+        "Made by `python benchmarks/reuse_rows.py`, which says how; rows that end in -s307 with `--seed 307`.",
+        "Processor seconds per frame at equal asked PSNR, frames alone and with neighbours; decibels below white.",
+        "A frame states the error that clip.json has.",
         "`stated - reached` is the mean over the judged frames of a clip, `at most` the worst frame. `flicker` is the",
         "squared change of the error between frames, 1 if errors of frames are independent. Where the budget has no",
         "neighbours, frames alone are predicted to cost no more.",

@@ -1,8 +1,8 @@
 """Scores the restorer that ships and every classical method on test clips: sensor x bits x light, by motion, too.
 
     qsim generate scenes/restorer_test.toml -o out/restorer_test
-    python docs/restorer_grid.py out/restorer_test                             # what is missing: hours
-    python docs/restorer_grid.py out/restorer_test --cells qis-3-3.25 --out out/grid --restorer out/mine
+    python benchmarks/restorer_grid.py out/restorer_test                             # what is missing: hours
+    python benchmarks/restorer_grid.py out/restorer_test --cells qis-3-3.25 --out out/grid --restorer out/mine
 
 A cell is RESULTS/NAME.json: QIS with 1 to 7 bits at six levels of light, and sums of 1, 7 and 31 SPAD planes at three.
 It grows by clips and methods; only what is missing is measured, and with other weights only the restorer. Classical
@@ -175,7 +175,7 @@ def write_tables(out: Path, names: Sequence[str], clips: Sequence[str]) -> None:
     lost = [name for (name, *_), gain in zip(rows, gains, strict=True) if gain < 0]
     text = ["# The restorer against every classical method", ""]
     text += [
-        "Made by `python docs/restorer_grid.py out/restorer_test` on the clips of `scenes/restorer_test.toml`.",
+        "Made by `python benchmarks/restorer_grid.py out/restorer_test` on the clips of `scenes/restorer_test.toml`.",
         "",
     ]
     text += [f"Matched PSNR in dB, peak 2.5 times the mean light, mean over {len(clips)} clips, "

@@ -1,6 +1,6 @@
 """Measures on a machine with a GPU what other machines cannot tell, in pieces that continue where they stopped.
 
-    python docs/gpu.py OUT [--section NAME] [--minutes 9] [--wheels FOLDER]
+    python benchmarks/gpu.py OUT [--section NAME] [--minutes 9] [--wheels FOLDER]
 
 Every measurement is a child process (gpu/child.py) that writes one file, OUT/SECTION/NAME.json. The same command again
 does what is missing; OUT/table.md and OUT/table.json hold everything so far. This program needs Python alone, so that

@@ -1,6 +1,6 @@
 """Checks the restorer that ships beside its grid: shifts by a pixel, real photons, and crops at four levels of light.
 
-    python docs/restorer_checks.py out/restorer_test COUNTS.npy     # docs/results/restorer_checks.md, .json, .jpg
+    python benchmarks/restorer_checks.py out/restorer_test COUNTS.npy     # docs/results/restorer_checks.md, .json, .jpg
 
 A restorer should not depend on where the grid of pixels lies: codes shifted by one pixel are restored, and the rms
 difference from the shifted result is compared with the rms error that is left. Real photons are counts [N, H, W] of a
@@ -131,7 +131,7 @@ def page(found: dict[str, Any]) -> str:
     text = [
         "# The restorer: shifts, real photons, crops",
         "",
-        "Made by `python docs/restorer_checks.py out/restorer_test COUNTS.npy`.",
+        "Made by `python benchmarks/restorer_checks.py out/restorer_test COUNTS.npy`.",
         "",
     ]
     text += [f"Weights {found['weights'][:12]}.", "", "## A shift by one pixel", ""]

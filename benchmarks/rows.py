@@ -1,6 +1,6 @@
 """Shares what programs of stored rows need: commands, the machine, and whether its cores were quiet.
 
-    python docs/rows.py     # the speed of the reference convolution, and how many cores other programs use now
+    python benchmarks/rows.py     # the speed of the reference convolution, and how many cores other programs use now
 
 Rows of a table compare networks by what they learn in a fixed time. A row that was made beside other programs got less,
 so busy cores are refused before a row begins, and a row states how many cores others used while it was made.

@@ -1,7 +1,7 @@
 """Finds the best bit depth for motion and light with the default restorer (`--method auto`).
 
-    python docs/restorer_bits.py                              # minutes; docs/results/restorer_bits.md, .png, .json
-    python docs/restorer_bits.py --scenes 1 --size 64 --out out/bits
+    python benchmarks/restorer_bits.py                             # minutes; docs/results/restorer_bits.md, .png, .json
+    python benchmarks/restorer_bits.py --scenes 1 --size 64 --out out/bits
 
     photographs that slide and hide one another -> light of 10,000 planes per second -> codes of 2^b - 1 planes each
     -> eleven codes around one instant, restored -> matched PSNR of that instant
@@ -125,7 +125,7 @@ def page(found: Array, scenes: int, size: int, weights: str) -> str:
     """Return the page of all numbers."""
     best = np.take(BITS, found.argmax(-1))
     three = BITS.index(3)
-    text = ["# The best bit depth with the default restorer", "", "Made by `python docs/restorer_bits.py`.", ""]
+    text = ["# The best bit depth with the default restorer", "", "Made by `python benchmarks/restorer_bits.py`.", ""]
     text += [f"Mean over {scenes} scenes of {size} x {size} px in which photographs slide before one another; "
              f"weights {weights[:12]}. PSNR is matched, peak 2.5 times the mean light. Light is counted in photons per "
              "pixel and plane of 0.1 ms, alike for all depths, motion in px per 3-bit code.", ""]  # fmt: skip

@@ -46,7 +46,7 @@ class Piece:
 def arguments(argv: list[str]) -> argparse.Namespace:
     """Return the checked arguments; argparse ends the program with code 2 where they are wrong."""
     about = "Measure what only a machine with a GPU can tell; the same command again continues."
-    parser = argparse.ArgumentParser("docs/gpu.py", description=about)
+    parser = argparse.ArgumentParser("benchmarks/gpu.py", description=about)
     parser.add_argument("out", type=Path, help="folder of the results; the same command continues there")
     parser.add_argument(
         "--section", choices=(*SECTIONS, "table"), help="measure one section; what failed in it is tried again"
@@ -207,7 +207,8 @@ def summed_up(piece: Piece, chosen: list[tuple[str, str]]) -> int:
 
 def shown(piece: Piece) -> str:
     """Return the command that makes such a piece."""
-    return f"python docs/gpu.py OUT{f' --section {piece.section}' if piece.section else ''} --minutes {piece.minutes:g}"
+    section = f" --section {piece.section}" if piece.section else ""
+    return f"python benchmarks/gpu.py OUT{section} --minutes {piece.minutes:g}"
 
 
 def main(argv: list[str] | None = None, *, sizes: dict[str, Any] | None = None, child: tuple[str, ...] = CHILD) -> int:

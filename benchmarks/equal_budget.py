@@ -1,8 +1,8 @@
 """Trains every network for the same time on the same clips, and writes one row per network, tables and curves.
 
-    python docs/equal_budget.py out/starter                       # 30 minutes for each row that is missing
-    python docs/equal_budget.py out/starter --rows emvd,unet      # these alone
-    python docs/equal_budget.py out/tiny --tiny --out out/rows    # seconds for each row: a test of this program
+    python benchmarks/equal_budget.py out/starter                       # 30 minutes for each row that is missing
+    python benchmarks/equal_budget.py out/starter --rows emvd,unet      # these alone
+    python benchmarks/equal_budget.py out/tiny --tiny --out out/rows    # seconds for each row: a test of this program
 
 A row is RESULTS/NAME.json. It is written when it is complete and made once; an interrupted one resumes from WORK. Per
 row: two short trials choose the learning rate on validation clips, one run uses it, and its weights are scored on test
@@ -228,7 +228,7 @@ def write_tables(out: Path) -> None:
     classical = next((row for row in rows if row["kind"] == "classical"), {"scores": {}})
     known: dict[str, Any] = classical["scores"]
     floor = mean_of(known[FLOOR][at]) if FLOOR in known else -math.inf
-    text = ["# Every network after the same time", "", "Made by `python docs/equal_budget.py out/starter`.", ""]
+    text = ["# Every network after the same time", "", "Made by `python benchmarks/equal_budget.py out/starter`.", ""]
     text += [LIMITS, ""]
     text += [f"![Validation PSNR over minutes of training]({out.name}.png)", ""]
     text += [f"## About one million multiply-adds per pixel and frame, {at}", ""]

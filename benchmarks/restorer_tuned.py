@@ -1,7 +1,7 @@
 """Trains the restorer that ships on single cells of its grid, and compares both on the test clips of these cells.
 
-    python docs/restorer_tuned.py out/photos out/restorer out/restorer_val out/restorer_test
-    python docs/restorer_tuned.py out/tiny out/tiny out/tiny out/tiny --tiny --out out/rows    # seconds: a test of this
+    python benchmarks/restorer_tuned.py out/photos out/restorer out/restorer_val out/restorer_test
+    python benchmarks/restorer_tuned.py out/tiny out/tiny out/tiny out/tiny --tiny --out out/rows  # a test of this
 
 One set of weights serves all cells. The cost of that is what a cell gains from weights for it alone: STEPS steps from
 the shipped ones, an estimated 20 minutes on two quiet cores, with windows of this cell alone. Busy cores change no
@@ -131,7 +131,10 @@ def write_table(out: Path) -> None:
         table.append((row["name"], f"{shipped.mean():.2f}", f"{tuned.mean():.2f}", f"{gain.mean():+.2f}", spread))
     size = rows[0]["size"]
     text = ["# The restorer beside weights for one cell", ""]
-    text += ["Made by `python docs/restorer_tuned.py out/photos out/restorer out/restorer_val out/restorer_test`.", ""]
+    text += [
+        "Made by `python benchmarks/restorer_tuned.py out/photos out/restorer out/restorer_val out/restorer_test`.",
+        "",
+    ]
     text += [f"{size['steps']} steps from the shipped weights with windows of one cell alone. Mean matched PSNR in dB "
              f"over {len(rows[0]['clips'])} test clips, {size['frames']} frames of each.", ""]  # fmt: skip
     text += [*markdown_table(table, ("cell", "shipped", "tuned", "difference", "of single clips")), ""]

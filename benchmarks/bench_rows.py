@@ -1,8 +1,8 @@
 """Measures what a restored frame costs, one row for each method, and writes the page of all rows.
 
-    python docs/bench_rows.py                             # the rows that are missing; hours of quiet cores
-    python docs/bench_rows.py --rows mergenet,qbp-bm3d    # these alone
-    python docs/bench_rows.py --tiny --out out/bench_rows # frames of 32 x 32 px on any cores: tries this program
+    python benchmarks/bench_rows.py                             # the rows that are missing; hours of quiet cores
+    python benchmarks/bench_rows.py --rows mergenet,qbp-bm3d    # these alone
+    python benchmarks/bench_rows.py --tiny --out out/bench_rows # frames of 32 x 32 px on any cores: tries this program
 
 A row is RESULTS/NAME.json, made once by `quiver bench` with two threads and no GPU. Frames have 512 x 1024 px; networks
 of a million multiply-adds per pixel and frame stand beside smaller ones of published width. The row `modes` compares
@@ -125,7 +125,7 @@ def write_page(out: Path) -> None:
     """Write OUT.md from the rows that exist."""
     rows = {path.stem: read_json(path) for path in sorted(out.glob("*.json"))}
     modes = rows.pop(MODES, None)
-    text = ["# What a restored frame costs", "", "Made by `python docs/bench_rows.py`.", ""]
+    text = ["# What a restored frame costs", "", "Made by `python benchmarks/bench_rows.py`.", ""]
     if rows:
         size = next(iter(rows.values()))["plan"]["size"]
         text += [f"## Frames of {size.replace('x', ' x ')} px", "", NOTES, *tiles_line(rows, size), ""]

@@ -13,36 +13,30 @@ PARTS = ("paths", "carrying", "denoiser", "surfaces", "scene", "choice", "truth"
 WAYS = {  # key in a row: its name on the page
     "naive, white": "naive loop",
     "naive, peak": "naive loop, to the percentile",
-    "earlier, white": "5c22140, same rms error",
-    "earlier, peak": "5c22140, as asked",
     "alone": "frames alone",
     "shared": "frames that share",
 }
 HEAD = """# What frames of a clip cost
 
-*Written by `python docs/clip_rows.py`, which says how. It makes missing rows, and marked ones again.*
+*Written by `python benchmarks/clip_rows.py`, which says how. It makes missing rows, and marked ones again.*
 
 <!-- not run: needs quiet cores for an hour or two -->
 ```sh
-python docs/clip_rows.py
-python docs/clip_rows.py --motion 0.3 --reference 256
-python docs/clip_rows.py --size 512x1024 --rows plain,room,lamp,fence,shadow
+python benchmarks/clip_rows.py
+python benchmarks/clip_rows.py --motion 0.3 --reference 256
+python benchmarks/clip_rows.py --size 512x1024 --rows plain,room,lamp,fence,shadow
 ```
 
 Processor seconds of a frame's radiance, without ground truth and writing, in one run per row: the naive loop (one
-`mi.render` per frame), the program of commit 5c22140, and this program with frames alone and with frames that share
-samples. **white** is the PSNR reached in dB below white, picture and truth clamped there. **percentile** is the PSNR in
-dB below the 99.9th percentile, without a clamp, as commit 5c22140 states it. That commit is asked for the same number
-of dB in its unit (**as asked**), and for the rms error that this number allows below white (**same rms error**), if
-that differs. The naive loop takes the power of two of samples that reaches the asked PSNR below white, or below the
-percentile. It is extrapolated from 64 samples. **times** is the time of the naive loop to white over the line's.
-Scenes have a speed at which the median moving pixel moves as stated.
+`mi.render` per frame), and this program with frames alone and with frames that share samples. **white** is the PSNR
+reached in dB below white, picture and truth clamped there. **percentile** is the PSNR in dB below the 99.9th
+percentile, without a clamp. The naive loop takes the power of two of samples that reaches the asked PSNR below white,
+or below the percentile. It is extrapolated from 64 samples. **times** is the time of the naive loop to white over the
+line's. Scenes have a speed at which the median moving pixel moves as stated.
 """
-AGREE = """## Are the scenes of both programs equal?
+REFERENCES = """## The references
 
-Each program is judged by its own converged pictures, drawn from equal seeds. **agree** is how these agree in dB below
-white, without their noise and less three standard errors; 80 dB, the most that is counted, are equal pictures.
-**noise** is the noise of one. Where they agree less than what frames reach, the scene has changed since.
+**noise** is the noise of the mean of the converged pictures that frames are compared with, in dB below white.
 """
 TIME = """## Where the time goes
 
@@ -56,7 +50,7 @@ def page(rows: dict[str, dict[str, Any]]) -> str:
     """Return the page of the rows, by name."""
     text = [HEAD] if rows else [HEAD, "No row is made yet."]
     if rows:
-        text += [*costs(rows), "", *medians(rows), "", AGREE, *agreements(rows), "", TIME]
+        text += [*costs(rows), "", *medians(rows), "", REFERENCES, *references(rows), "", TIME]
         text += [*breakdown(rows), ""]
     if any(not row["quiet"] for row in rows.values()):
         text += [f"{MARK} made beside other programs.", ""]
@@ -90,7 +84,7 @@ def medians(rows: dict[str, dict[str, Any]]) -> list[str]:
         chosen = [row["ways"] for row in rows.values() if kind_of(row) == kind]
         every = {way: median(seconds_of(ways, way) for ways in chosen) for way in WAYS}
         for way, seconds in every.items():
-            ratios = (f"{every[other] / seconds:.2f}" for other in ("naive, white", "earlier, white", "alone"))
+            ratios = (f"{every[other] / seconds:.2f}" for other in ("naive, white", "alone"))
             lines.append((kind, str(len(chosen)), WAYS[way], f"{seconds:.3f}", *ratios))
     header = (
         "size and motion",
@@ -98,7 +92,6 @@ def medians(rows: dict[str, dict[str, Any]]) -> list[str]:
         "way",
         "median s",
         "naive loop / this",
-        "5c22140, same rms error / this",
         "alone / this",
     )
     return ["Ratios of medians over the rows:", "", *markdown_table(lines, header)]
@@ -111,24 +104,23 @@ def kind_of(row: dict[str, Any]) -> str:
 
 
 def seconds_of(ways: dict[str, Any], way: str) -> float:
-    """Return the seconds of a way; where frames do not share, those alone, and where units agree, those as asked."""
-    other = {"shared": "alone", "earlier, white": "earlier, peak"}.get(way, way)
+    """Return the seconds of a way; where frames do not share, those alone."""
+    other = "alone" if way == "shared" else way
     return float(ways.get(way, ways[other])["processor_seconds"])
 
 
-def agreements(rows: dict[str, dict[str, Any]]) -> list[str]:
+def references(rows: dict[str, dict[str, Any]]) -> list[str]:
     """Return the table of speeds and converged pictures."""
     lines = [
         (
             marked(name, row),
             f"{row['speed']:g}",
             f"{row['motion']:.2f}",
-            f"{row['references']['agree']:.1f}",
             f"{row['references']['noise']:.1f}",
         )
         for name, row in rows.items()
     ]
-    return markdown_table(lines, ("scene", "speed", "px/frame", "agree [dB]", "noise [dB]"))
+    return markdown_table(lines, ("scene", "speed", "px/frame", "noise [dB]"))
 
 
 def breakdown(rows: dict[str, dict[str, Any]]) -> list[str]:

@@ -1,6 +1,6 @@
 """Measures the speed of qsim, visionsim and Pyxel at drawing frames from the same light, in one run.
 
-python docs/neighbours.py VISIONSIM_PYTHON PYXEL_PYTHON     # interpreters of environments that have these packages
+python benchmarks/neighbours.py VISIONSIM_PYTHON PYXEL_PYTHON    # interpreters of environments that have these packages
 
 Every program draws frames of 512 x 512 pixels from the light of a photograph, 3.25 photons per pixel, on one thread, in
 its own process: single-photon frames of 1 bit, and frames of 4 bits with shot noise, dark current, read noise and an

@@ -1,8 +1,8 @@
 """Measures what a frame of equal error costs here and in Blender's Cycles 5.0, on the same scenes and two threads.
 
-    python docs/cycles_rows.py --cycles PYTHON                # three scenes at 128 x 256: an hour or two
-    python docs/cycles_rows.py --cycles PYTHON --rows plain --busy
-    python docs/cycles_rows.py --cycles PYTHON --tiny --out out/rows      # minutes: a test of this program
+    python benchmarks/cycles_rows.py --cycles PYTHON                # three scenes at 128 x 256: an hour or two
+    python benchmarks/cycles_rows.py --cycles PYTHON --rows plain --busy
+    python benchmarks/cycles_rows.py --cycles PYTHON --tiny --out out/rows      # minutes: a test of this program
 
 PYTHON is that of an environment with bpy, which cycles_render.py alone imports. A row is RESULTS/SCENE-SIZE.json. It is
 written when it is complete, and made once. Only missing rows are made, and marked ones again on quiet cores.
@@ -89,7 +89,7 @@ class Cycles:
 
     def __init__(self, python: str, folder: Path, plan: Plan) -> None:
         self.scene, self._out, self._plan = folder / "scene.npz", folder / "out.npz", plan
-        self._start = [python, str(ROOT / "docs" / "cycles_render.py"), str(self.scene), str(self._out)]
+        self._start = [python, str(ROOT / "benchmarks" / "cycles_render.py"), str(self.scene), str(self._out)]
 
     def render(self, samples: int, bounces: int, *options: str) -> dict[str, Array]:
         """Return radiance [T, H, W] and seconds [T, 2]; `ValueError` with the last line of its error."""

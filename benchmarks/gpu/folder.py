@@ -93,7 +93,9 @@ def gpus() -> list[str]:
 def setup(packages: Path) -> dict[str, Any]:
     """Return what a result depends on beside the machine: versions of packages, and this program."""
     digest = hashlib.sha256()
-    for file in sorted(p for part in ("qsim", "quiver", "scenes", "docs/gpu") for p in (ROOT / part).rglob("*.py")):
+    for file in sorted(
+        p for part in ("qsim", "quiver", "scenes", "benchmarks/gpu") for p in (ROOT / part).rglob("*.py")
+    ):
         digest.update(file.read_bytes())
     return {"program": digest.hexdigest()[:12], "packages": {name: version(name, packages) for name in PACKAGES}}
 

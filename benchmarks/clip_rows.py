@@ -1,33 +1,25 @@
-"""Measures what a frame of equal error costs: naive loop, program of commit 5c22140, frames alone, frames that share.
+"""Measures what a frame of equal error costs: naive loop, frames alone, frames that share.
 
-    python docs/clip_rows.py                                         # nine families at 128 x 256: half an hour
-    python docs/clip_rows.py --size 512x1024 --rows plain,room,lamp  # half an hour
-    python docs/clip_rows.py --tiny --out out/rows                   # minutes: a test of this program
+    python benchmarks/clip_rows.py                                         # nine families at 128 x 256: half an hour
+    python benchmarks/clip_rows.py --size 512x1024 --rows plain,room,lamp  # half an hour
+    python benchmarks/clip_rows.py --tiny --out out/rows                   # minutes: a test of this program
 
 A row is RESULTS/FAMILY-SIZE.json. It is written when it is complete, and made once. Only missing rows are made, and
 marked ones again on quiet cores.
 
 Errors are in two units: dB below white, with picture and truth clamped there (qsim/clip/clamped_error.py), and dB below
-the 99.9th percentile without a clamp, which commit 5c22140 asks for. That program is taken from the history of git and
-runs in a separate process. It is asked twice: for the PSNR in its own unit, and for the rms error that the PSNR below
-white allows. The naive loop is rendered with TRIAL samples; by MSE = c / samples, the power of two that reaches the
-PSNR in each unit follows, and its time.
+the 99.9th percentile without a clamp. The naive loop is rendered with TRIAL samples; by MSE = c / samples, the power of
+two that reaches the PSNR in each unit follows, and its time.
 
-Each program is judged by its own converged pictures, drawn from equal seeds. The squared error of a picture F is the
-mean of (F - R1)(F - R2) over two halves of them. Processor seconds are of all threads, medians over frames without the
-first.
+The squared error of a picture F is the mean of (F - R1)(F - R2) over two halves of converged pictures.
+Processor seconds are of all threads, medians over frames without the first.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
-import json
 import math
-import os
-import subprocess
 import sys
-import tarfile
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -39,7 +31,7 @@ from typing import Any
 import numpy as np
 from clip_page import page
 from clip_parts import meta, timed_frames
-from cycles_rows import agreement, use_only
+from cycles_rows import use_only
 from numpy import ndarray as Array
 from reuse_rows import FAMILIES, decibels
 from rows import ROOT, grow, keep_apart
@@ -48,16 +40,14 @@ from qsim import scenes
 from qsim.clip.clamped_error import white_in
 from qsim.clip.motion_statistics import MOVING
 from qsim.clip.writer import ClipWriter
-from qsim.colour import bright_end, psnr
+from qsim.colour import bright_end
 from qsim.rendering.budget import Budget
 from qsim.rendering.fidelity import DEEPEST, choose_budget
 from qsim.rendering.renderer import Renderer
 from qsim.scene import Scene, describe
 from qsim.studies.validation.rendering import NaiveLoop
 
-EARLIER = "5c22140"
 TRIAL = 64  # samples per pixel of the naive loop
-SAME = 0.05  # dB; units that differ by less are asked for once
 TRIED = 6  # speeds
 TARGETS = {  # function: part of a frame
     "qsim.rendering.renderer:Renderer.frame": "choice",
@@ -101,8 +91,8 @@ def plan_of(height: int, width: int, motion: float, reference: int | None) -> Pl
     return replace(plan, reference=reference or plan.reference)
 
 
-def measure(family: str, plan: Plan, there: Path) -> dict[str, Any]:
-    """Return the row of a family; `there` is the folder of the earlier program."""
+def measure(family: str, plan: Plan) -> dict[str, Any]:
+    """Return the row of a family."""
     scene, motion = moving_scene(family, plan)
     deep = Renderer(scene, budget=Budget(plan.reference, DEEPEST), seed=plan.seed + 1000)
     halves = [deep.halves([deep.time(t)], deep.budget, deep.key(t)) for t in plan.judged]
@@ -112,18 +102,13 @@ def measure(family: str, plan: Plan, there: Path) -> dict[str, Any]:
     ours = {"alone": ours_at(scene, plan, own, False), "shared": ours_at(scene, plan, own, True)}
     if not ours["shared"]["neighbours"]:
         del ours["shared"]
-    levels = [plan.level]
-    if (apart := psnr(peak, white)) > SAME:  # the rms error of a PSNR below white, as a PSNR below the peak
-        levels.append(round(plan.level + apart, 3))
-    other, earlier = earlier_program(scene, plan, levels, there)
-    agree = agreement(own, other, white)["difference"]
     return {
         "speed": scene.speed,
         "motion": round(motion, 3),
         "white": white,
         "peak": peak,
-        "references": {"agree": agree, "noise": noise_of(own, white)},
-        "ways": {**naive, **earlier, **ours},
+        "references": {"noise": noise_of(own, white)},
+        "ways": {**naive, **ours},
     }
 
 
@@ -222,50 +207,6 @@ def extrapolated(found: dict[str, float], unit: str, level: float, seconds: floa
     }
 
 
-def earlier_program(scene: Scene, plan: Plan, levels: list[float], there: Path) -> tuple[Array, dict[str, Any]]:
-    """Return the references [2, J, H, W] of the earlier program, and what it costs and reaches at each level [dB]."""
-    request = {name: value for name, value in vars(plan).items() if name not in ("level", "motion")}
-    request |= {"family": scene.name, "speed": scene.speed, "levels": levels}
-    with tempfile.TemporaryDirectory() as folder:
-        asked, out = Path(folder) / "request.json", Path(folder) / "out.npz"
-        asked.write_text(json.dumps(request))
-        run_there(there, str(ROOT / "docs" / "clip_earlier.py"), str(asked), str(out))
-        with np.load(out) as stored:
-            references, pictures, about = stored["references"], stored["pictures"], json.loads(str(stored["about"]))
-    ways = {}
-    for unit, level, frames, told in zip(("peak", "white"), levels, pictures, about, strict=False):
-        ways[f"earlier, {unit}"] = told | {"asked": level, "reached": reached(frames, references)}
-    return references, ways
-
-
-def unpack(folder: Path) -> None:
-    """Write the program of commit EARLIER to a folder; `ValueError` where the history does not hold it."""
-    done = subprocess.run(["git", "archive", EARLIER, "qsim", "scenes"], cwd=ROOT, capture_output=True, check=False)
-    if done.returncode:
-        raise ValueError(
-            f"commit {EARLIER} is needed, and this copy lacks its history; fetch it: git fetch --unshallow"
-        )
-    with tarfile.open(fileobj=io.BytesIO(done.stdout)) as archive:
-        archive.extractall(folder, filter="data")
-
-
-def beside_earlier(name: str, plan: Plan) -> dict[str, Any]:
-    """Return the row of a family, with the earlier program unpacked to a folder that is then deleted."""
-    with tempfile.TemporaryDirectory() as folder:
-        unpack(Path(folder))
-        return measure(name, plan, Path(folder))
-
-
-def run_there(folder: Path, *words: str) -> str:
-    """Return what Python prints with the program in a folder; `ValueError` with the last line of its error."""
-    line, env = [sys.executable, *words], os.environ | {"PYTHONPATH": str(folder)}
-    done = subprocess.run(line, env=env, cwd=folder, capture_output=True, text=True, check=False)
-    if done.returncode:
-        said = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise ValueError(f"{' '.join(words[:3])} stopped with code {done.returncode}: {said}")
-    return done.stdout
-
-
 def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rows", default=",".join(FAMILIES), help="families, separated by commas")
@@ -286,7 +227,7 @@ def main(words: list[str] | None = None) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
         for name in args.rows.split(","):
             path = args.out / f"{name}-{plan.height}x{plan.width}{fast}.json"
-            grow(path, plan, partial(beside_earlier, name, plan), page, busy=busy, marked_again=True)
+            grow(path, plan, partial(measure, name, plan), page, busy=busy, marked_again=True)
     except ValueError as error:
         print(f"clip_rows: {error}", file=sys.stderr)
         return 2

@@ -1,6 +1,6 @@
 """Times the restorer that ships beside QBP + BM3D of an older commit, in turn and in one run.
 
-    python docs/restorer_cost.py                 # docs/results/restorer_cost.md; about six minutes of quiet cores
+    python benchmarks/restorer_cost.py                 # docs/results/restorer_cost.md; about six minutes of quiet cores
 
 Both restore eleven frames of 512 x 1024: a photograph that slides by 2 px/frame, 3 bits, 3.25 PPP, with the threads
 of their defaults. Each program is a separate process that stays, their runs alternate, and the first ones are not
@@ -198,7 +198,7 @@ def page(found: dict[str, list[tuple[float, float]]], memory: int, size: str, bu
         )
         for name, runs in found.items()
     ]
-    text = ["# What the restorer costs", "", "Made by `python docs/restorer_cost.py`.", ""]
+    text = ["# What the restorer costs", "", "Made by `python benchmarks/restorer_cost.py`.", ""]
     text += [f"Seconds per frame of {size}, eleven frames at 3 bits and 3.25 PPP, both programs in turn.", ""]
     text += [*markdown_table(table, ("program", "median [s]", "runs [s]", "most memory of the process")), ""]
     text += [f"`quiver restore` of these frames takes {memory / 1e6:.0f} MB, its complete process counted. The "

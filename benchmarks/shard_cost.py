@@ -1,11 +1,10 @@
 """Compares what a shard was planned to cost with what it cost, and measures what its clips hold.
 
-    python docs/shard_cost.py --alone out/plan_alone.json --reuse out/plan.json     # the page of plans alone
-    python docs/shard_cost.py --shard-plan out/plan_shard.json --data out/i2        # adds the shard: a minute
+    python benchmarks/shard_cost.py --alone out/plan_alone.json --reuse out/plan.json     # the page of plans alone
+    python benchmarks/shard_cost.py --shard-plan out/plan_shard.json --data out/i2        # adds the shard: a minute
 
 Writes docs/results/i2.json, .md and .png. Parts that are not given are those that i2.json holds. Plans are the output
-of `qsim plan --json`; that of commit EARLIER asks for the same number of dB below another peak. What a clip cost is
-read from its log, which its worker writes when the clip is finished.
+of `qsim plan --json`. What a clip cost is read from its log, which its worker writes when the clip is finished.
 """
 
 from __future__ import annotations
@@ -13,14 +12,13 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rows import processor
 from shard_contents import contents
-from shard_page import EARLIER, WAYS, draw, page
+from shard_page import WAYS, draw, page
 
 from qsim import files
 from qsim.cli.options import part_of
@@ -68,24 +66,6 @@ def read_plan(path: Path, wanted: dict[str, Recipe], what: str) -> dict[str, Any
         return {"way": way, **totals_of(plan), "kinds": kinds}
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path}: lacks {error}; make it again with `qsim plan --json`") from None
-
-
-def read_earlier(path: Path, wanted: Recipe) -> dict[str, Any]:
-    """Return the totals of a plan by commit EARLIER. It does not name its recipe, so the clips of families are counted.
-
-    `ValueError` if it is another plan.
-    """
-    plan = read_json(path)
-    try:
-        clips: Counter[str] = Counter()
-        for kind in plan["kinds"]:
-            clips[kind["family"]] += kind["clips"]
-        expected = Counter(job.stem for job in wanted.jobs)
-        if "digest" in plan or clips != expected:
-            raise ValueError(f"{path}: is not the plan that commit {EARLIER} makes of {wanted.name}")
-        return totals_of(plan)
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path}: lacks {error}; make it again by commit {EARLIER}") from None
 
 
 def totals_of(plan: dict[str, Any]) -> dict[str, Any]:
@@ -168,8 +148,6 @@ def gather(args: argparse.Namespace) -> dict[str, Any]:
         plans["alone"] = read_plan(args.alone, {"alone": ways["alone"]}, f"{name} with reuse = false")
     if args.reuse is not None:
         plans["reuse"] = read_plan(args.reuse, {"reuse": ways["reuse"]}, f"{name} without reuse")
-    if args.earlier is not None:
-        plans["earlier"] = read_earlier(args.earlier, wanted)
     if args.shard_plan is not None:
         plans["shard"] = read_plan(args.shard_plan, parts, f"shard {written} of {name}")
     made = old.get("made") if args.data is None else read_shard(args.data, parts, name)
@@ -186,7 +164,6 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--recipe", default="i2_2000fps", help="a .toml file or a name (default i2_2000fps)")
     parser.add_argument("--alone", type=Path, help="plan of the recipe with reuse = false")
     parser.add_argument("--reuse", type=Path, help="plan of the recipe, which may share")
-    parser.add_argument("--earlier", type=Path, help=f"plan of the recipe by commit {EARLIER}")
     parser.add_argument("--shard-plan", type=Path, help="plan of the shard")
     parser.add_argument("--data", type=Path, help="data set folder that holds the shard")
     parser.add_argument("--shard", type=part_of, default=(1, 100), metavar="I/N", help="default 1/100")

@@ -1,13 +1,13 @@
 """Trains every network of published width for the same number of steps, all at once, as one GPU can.
 
-    python docs/equal_steps.py out/starter --steps 400                      # the rows that are missing
-    python docs/equal_steps.py out/tiny --steps 2 --tiny --out out/rows     # a test of this program
+    python benchmarks/equal_steps.py out/starter --steps 400                      # the rows that are missing
+    python benchmarks/equal_steps.py out/tiny --steps 2 --tiny --out out/rows     # a test of this program
 
 A row is RESULTS/NAME.json. It is written when it is complete and made once. Two trials with a sixth of the steps choose
 the learning rate on validation clips, one run uses it, and its weights are scored on test clips at the light of
 training. All train by Adam on four windows per step. The row of classical methods needs no training. All rows share a
-GPU, so no row has a time; docs/equal_budget.py compares equal times. Networks that learn from the streams which they
-restore have no row.
+GPU, so no row has a time; equal_budget.py compares equal times. Networks that learn from the streams which they restore
+have no row.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def write_table(out: Path) -> None:
         lines.append((mean_of(found), cells))
     header = (*HEADER[:4], *("parameters", "rate", "last validation [dB]"), *HEADER[8:-3])
     budget = rows[0]["budget"] if rows else {"steps": 0, "batch": 0}
-    command = f"python docs/equal_steps.py out/starter --steps {budget['steps']}"
+    command = f"python benchmarks/equal_steps.py out/starter --steps {budget['steps']}"
     text = [
         *("# Every network after the same steps", ""),
         *(f"Made by `{command}`: steps of {budget['batch']} windows.", ""),

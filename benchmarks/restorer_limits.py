@@ -1,7 +1,7 @@
 """Measures the restorer that ships where its grid does not reach: flat fields, few frames, faults, light that changes.
 
-    python docs/restorer_limits.py                            # ten minutes; docs/results/restorer_limits.md, .json
-    python docs/restorer_limits.py --draws 2 --size 48 --out out/limits
+    python benchmarks/restorer_limits.py                           # ten minutes; docs/results/restorer_limits.md, .json
+    python benchmarks/restorer_limits.py --draws 2 --size 48 --out out/limits
 
 Every number is a mean over draws with its standard error. Draws differ in the sensor's noise and, where something
 moves, in the scene: photographs that slide (restorer_bits.py).
@@ -250,7 +250,7 @@ def told(values: Sequence[float], digits: int) -> str:
 
 def page(found: dict[str, Any]) -> str:
     """Return the page of what was measured."""
-    text = ["# The restorer outside of its grid", "", "Made by `python docs/restorer_limits.py`.", ""]
+    text = ["# The restorer outside of its grid", "", "Made by `python benchmarks/restorer_limits.py`.", ""]
     text += [f"Weights {found['weights'][:12]}, {found['draws']} draws of {found['size']} x {found['size']} px and "
              f"{FRAMES} frames; mean and standard error. The frame in the middle is scored, {EDGE} px from its edges. "
              "Sensor `quiver-physical` where none is named.", ""]  # fmt: skip
