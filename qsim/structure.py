@@ -214,6 +214,11 @@ def _flickers(value: Any) -> bool:
     return list_of(is_light)(strengths) and bool(strengths)
 
 
+TIMES: Table = {
+    "unit": TEXT,
+    "source": TEXT,
+    "values": expected("a list of numbers", list_of(is_number)),
+}
 _FRAME = r"(?:radiance|sharp|truth|saturated)/[0-9]{6,}\.exr"
 CLIP: Table = {
     "shape": SHAPE,
@@ -247,6 +252,7 @@ CLIP: Table = {
     "job, if any": TEXT,
     "source, if any": OBJECT,
     "orientation, if any": TEXT,
+    "times, if any": TIMES,
     "render, if any": {
         "findings, if any": expected(
             "a list of texts by effect, chosen, size",
@@ -277,6 +283,7 @@ STREAM: Table = {
     "sha256, if any": DIGEST,
     "orientation, if any": TEXT,
     "source, if any": OBJECT,
+    "times, if any": TIMES,
     "defects, if any": OBJECT,
     "rows, if any": {"delay": POSITIVE, "order": TEXT},
     "colour, if any": OBJECT,

@@ -64,6 +64,8 @@ OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
     ),
     "video": (("av",), "video files: qsim convert, qsim preview"),
     "formats": (("zarr", "h5py"), "Zarr and HDF5 files: qsim convert, qsim calibrate"),
+    "tiff": (("imagecodecs",), "compressed TIFF (LZW, CCITT, zstd) and 12-bit TIFF: qsim convert"),
+    "tcspc": (("ptufile", "sdtfile"), "photon counts of PTU and SDT files: qsim convert"),
     "cluster": (("distributed",), "qsim generate --cluster"),
     "denoise": (("pyoidn",), "fewer samples at the same error: qsim render, qsim generate"),
 }

@@ -10,7 +10,8 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,10 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import check_shape
-from qsim.colour import to_linear
+from qsim.colour import luminance, to_linear
 from qsim.file_order import numbered
 from qsim.files import decoding_errors, load_array
+from qsim.formats import axes
 from qsim.formats.recording import (
     Hints,
     Recording,
@@ -81,38 +83,66 @@ def written_with(path: Path, description: str) -> dict[str, Any] | None:
     return found if ours else None
 
 
+@dataclass(frozen=True)
+class Values:
+    """An array of a file, read by parts: its shape, its type, and blocks of it by an index."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    read: Callable[[tuple[Any, ...]], Array]
+
+
 def read_codes_npy(path: Path, hints: Hints) -> Recording:
     """Read unpacked codes: bool or whole numbers [T, H, W], one code per pixel; bits as given, 1 for bool."""
     array = load_array(path)
-    frames, height, width = check_shape(path, array.shape)
-    bits = 1 if array.dtype == bool else hints.bits
-    if bits is None or array.dtype.kind not in "bui":
-        raise ValueError(f"{path}: {array.dtype} codes need a number of bits, as in --bits 3")
-
-    def read(start: int, stop: int) -> Array:
-        return checked_codes(path, np.asarray(array[start:stop]), bits, start)
-
-    return Recording((frames, height, width), read, "codes", bits)
+    return codes_of(path, Values(array.shape, array.dtype, lambda index: array[index]), "codes", hints)
 
 
 def read_light_npy(path: Path, hints: Hints) -> Recording:
     """Read numbers [T, H, W] as light: integers by --transfer (full scale of their type), floats are linear."""
     array = load_array(path)
-    shape = check_shape(path, array.shape)
-    if array.dtype == bool:
+    return light_of(path, Values(array.shape, array.dtype, lambda index: array[index]), ".npy", hints)
+
+
+def codes_of(path: Path, values: Values, source: str, hints: Hints) -> Recording:
+    """Return an array as codes of one bit (bool) or of the stated bits; its axes by --axes."""
+    reading = axes.named(path, values.shape, hints)
+    if reading.colour:
+        raise ValueError(f"{path}: colours hold no codes; name the axis of channels C, and choose one with --channel")
+    shape = check_shape(path, reading.shape(values.shape))
+    bits = 1 if values.dtype == bool else hints.bits
+    if bits is None or values.dtype.kind not in "bui":
+        raise ValueError(f"{path}: {values.dtype} codes need a number of bits, as in --bits 3")
+
+    def read(start: int, stop: int) -> Array:
+        return checked_codes(path, reading.turned(np.asarray(values.read(reading.block(start, stop)))), bits, start)
+
+    return Recording(shape, read, source, bits, reading=reading.said)
+
+
+def light_of(path: Path, values: Values, source: str, hints: Hints) -> Recording:
+    """Return an array as light, in colour as luminance; its axes by --axes."""
+    reading = axes.named(path, values.shape, hints)
+    full_shape = reading.shape(values.shape)
+    if reading.colour and full_shape[3] != 3:
+        raise ValueError(f"{path}: axis S has {full_shape[3]} colours; red, green and blue are read")
+    shape = check_shape(path, full_shape[:3])
+    if values.dtype == bool:
         raise ValueError(f"{path}: bool values are codes of one bit, not light; leave --layout out")
-    floats = array.dtype.kind == "f"
+    floats = values.dtype.kind == "f"
     transfer = "linear" if floats and hints.transfer is None else need_transfer(path, hints)
-    top = 1.0 if floats else float(np.iinfo(array.dtype).max)
+    top = 1.0 if floats else float(np.iinfo(values.dtype).max)
     full = float("inf") if floats else top
     white, _ = white_of(path, hints, full)
 
     def marked(start: int, stop: int) -> tuple[Array, Array]:
-        values = _checked_light(path, array[start:stop], start)
-        light = values.astype(np.float32) if floats and transfer == "linear" else to_linear(values, transfer, top)
-        return light, reached(values, white)
+        block = reading.turned(np.asarray(values.read(reading.block(start, stop))))
+        found = _checked_light(path, block, start)
+        light = found.astype(np.float32) if floats and transfer == "linear" else to_linear(found, transfer, top)
+        return luminance(light) if reading.colour else light, reached(found, white, reading.colour)
 
-    return light_recording(path, shape, marked, ".npy", {"transfer": transfer}, hints, full)
+    found = light_recording(path, shape, marked, source, {"transfer": transfer}, hints, full)
+    return replace(found, reading=reading.said)
 
 
 def read_zarr(path: Path, hints: Hints) -> Recording:
@@ -255,12 +285,13 @@ def _bits_of_sums(path: Path, planes: int, bits: int | None) -> int:
 
 def _checked_light(path: Path, values: Array, first: int) -> Array:
     """Return the values if they are finite, not negative and within float32; else `ValueError` with the pixel."""
-    good = (values >= 0) & (values < 3e38)
+    wide = values.astype(np.float32) if values.dtype == np.float16 else values  # the limit is no half float
+    good = (wide >= 0) & (wide < 3e38)
     if not good.all():
-        t, y, x = (int(i) for i in np.argwhere(~good)[0])
+        t, y, x = (int(i) for i in np.argwhere(~good)[0][:3])
         place = f"(t, y, x) = ({first + t}, {y}, {x})"
         raise ValueError(f"{path}: value {values[t, y, x]} at {place} is not a light level: expected finite and >= 0")
-    return np.asarray(values)
+    return np.asarray(wide)
 
 
 def write_cube(path: Path, blocks: Iterator[Array], shape: tuple[int, int, int]) -> None:

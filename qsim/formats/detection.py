@@ -9,7 +9,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.files import load_array
-from qsim.formats import array_files, images, mat_files, photon_times, raw_cameras, raw_layout, video
+from qsim.formats import array_files, hdf5, images, mat_files, photon_times, raw_cameras, raw_layout, video
 from qsim.formats.recording import Hints, Recording
 
 Reader = Callable[[Path, Hints], Recording]
@@ -26,6 +26,7 @@ LAYOUTS: dict[str, Reader] = {  # the names of --layout
     "visionsim": array_files.read_visionsim,
     "zarr": array_files.read_zarr,
     "mat": mat_files.read_mat,
+    "hdf5": hdf5.read_hdf5,
     "spike": raw_cameras.read_spike,
     "photons": photon_times.read_photons,
     "raw": raw_layout.read_raw,
@@ -47,9 +48,10 @@ ASSUMED: dict[str, tuple[str, str]] = {
     "visionsim": ("msb", "upright"),  # np.packbits along rows of pictures as rendered
     "zarr": (_WHOLE, "upright"),  # quanta-spad-sim draws row 0 on top
     "photons": (_WHOLE, "upright"),  # as the stream that it was made from
+    "hdf5": (_WHOLE, "upright"),  # as arrays are shown
     "mat": (_WHOLE, "as stored"),  # OUTPUT's rows are the array's; the camera's orientation is not in a file
 }
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".ts", ".m4v", ".gif")
 PICTURES = {".png": "png", ".tif": "tiff", ".tiff": "tiff"}
 ZARR = ("zarr.json", ".zgroup", ".zarray")
 PARTS = (*PICTURES, ".json", ".db", ".mat", ".bin", ".npy")  # kinds of files that make a folder a single recording
@@ -68,6 +70,7 @@ def detect(path: Path, hints: Hints | None = None) -> str:
     suffix = "".join(path.suffixes[-2:]) if path.suffix == ".gz" else path.suffix.lower()
     simple = {".png": "png", ".tif": "tiff", ".tiff": "tiff", ".mat": "mat", ".dat": "spike", ".npz": "photons"}
     simple |= {".mraw": "mraw", ".cihx": "mraw", ".cih": "mraw"}
+    simple |= dict.fromkeys((".h5", ".hdf5", ".hdf", ".he5", ".nxs"), "hdf5")
     if suffix in simple:
         return simple[suffix]
     if suffix in VIDEOS:
@@ -148,8 +151,14 @@ def _detect_npy(path: Path, hints: Hints) -> str:
         return "light"
     if array.dtype != np.uint8:
         return "codes" if hints.bits is not None and array.dtype.kind in "ui" else "light"
-    if array.ndim == 4 or hints.width is not None or array_files.written_with(path, f"{path.name}.json") is not None:
+    if (
+        (array.ndim == 4 and hints.axes is None)
+        or hints.width is not None
+        or array_files.written_with(path, f"{path.name}.json") is not None
+    ):
         return "cube"
+    if hints.axes is not None:
+        return "codes" if hints.bits is not None else "light"
     top = max((int(array[t].max()) for t in range(len(array)) if array[t].size), default=0)
     bits = max(top.bit_length(), 1)
     if hints.bits is not None and bits <= hints.bits:

@@ -6,9 +6,8 @@ pixel, or stretched to 0 ... 255). Colour becomes linear luminance (Rec. 709). M
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,12 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files
-from qsim.checks import MAX_PIXELS, check_shape
+from qsim.checks import check_shape
 from qsim.clip import exr
 from qsim.colour import from_linear, luminance, to_linear
-from qsim.file_order import numbered
+from qsim.file_order import numbered, places
 from qsim.files import decoding_errors
+from qsim.formats import gaps, tiff
 from qsim.formats.recording import (
     Hints,
     Recording,
@@ -40,13 +40,14 @@ def read_png(path: Path, hints: Hints) -> Recording:
     pictures = [path] if path.is_file() else _pngs(path)
     if not pictures:
         raise FileNotFoundError(f"{path}: holds no .png")
-    first = _png(pictures[0])
-    shape = check_shape(path, (len(pictures), *first.shape[:2]))
+    codes = hints.bits is not None or (hints.transfer is None and hints.white is None)
+    first = _png(pictures[0], codes)
+    shape = check_shape(path, (len(pictures), *first.pixels.shape[:2]))
 
     def raw(start: int, stop: int) -> Array:
-        return _same_size(pictures[start:stop], [_png(p) for p in pictures[start:stop]], first.shape, first.dtype)
+        return _same_kind(pictures[start:stop], [_png(p, codes) for p in pictures[start:stop]], first)
 
-    return picture(path, shape, raw, first.dtype, "PNG", hints)
+    return replace(picture(path, shape, raw, first, "PNG", hints), times=gaps.of_names(pictures))
 
 
 def read_pictures(folder: Path) -> Iterator[Array]:
@@ -55,14 +56,14 @@ def read_pictures(folder: Path) -> Iterator[Array]:
     `ValueError` for a folder without any, for numbers that leave one out, and for pictures of another depth or of
     different sizes.
     """
-    first: Array | None = None
+    first: Page | None = None
     _check_complete(folder, _pngs(folder))
     for file in _pngs(folder):
-        image = _png(file)
+        image = _png(file, codes=False)
         first = image if first is None else first
-        if image.dtype != np.uint8:
-            raise ValueError(f"{file}: pixels of {image.dtype}, not of 8 bits")
-        yield _same_size([file], [image], first.shape, first.dtype)[0]
+        if image.depth != 8:
+            raise ValueError(f"{file}: pixels of {image.depth} bits, not of 8")
+        yield _same_kind([file], [image], first)[0]
 
 
 def _pngs(folder: Path) -> list[Path]:
@@ -78,12 +79,38 @@ def _check_complete(folder: Path, pictures: list[Path]) -> None:
     """Raise `ValueError` if there are no pictures, or if their numbers, the last in each name, leave one out."""
     if not pictures:
         raise ValueError(f"{folder}: holds no .png; give its frames as PNG")
-    numbers = [re.findall(r"\d+", file.stem) for file in pictures]
-    for i in range(1, len(pictures)):
-        if numbers[i - 1] and numbers[i] and int(numbers[i][-1]) > int(numbers[i - 1][-1]) + 1:
-            raise ValueError(
-                f"{folder}: no frame is between {pictures[i - 1].name} and {pictures[i].name}; add what is missing"
-            )
+    numbers = places(pictures) or []
+    for before, after, name, following in zip(numbers, numbers[1:], pictures, pictures[1:], strict=False):
+        if after > before + 1:
+            raise ValueError(f"{folder}: no frame is between {name.name} and {following.name}; add what is missing")
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """A picture as its file stores it, upright."""
+
+    pixels: Array  # [H, W] or [H, W, 3]; bool of one bit
+    depth: int  # bits per sample, as the header states
+    orientation: int = 1  # tag that was applied
+
+    @property
+    def kind(self) -> str:
+        return f"{self.depth}-bit {list(self.pixels.shape)}"
+
+
+ORIENTATIONS = range(1, 9)  # of TIFF and EXIF
+
+
+def turned(pixels: Array, orientation: int) -> Array:
+    """Return a picture [H, W(, C)] upright, as a TIFF or EXIF orientation 1 ... 8 says.
+
+    1 as stored, 2 mirrored left-right, 3 turned by 180 degrees, 4 mirrored up-down, 5 transposed, 6 turned by 90
+    degrees clockwise, 7 transposed along the other diagonal, 8 turned by 90 degrees counterclockwise.
+    """
+    across = pixels.swapaxes(0, 1) if orientation >= 5 else pixels
+    rows = -1 if orientation in (3, 4, 7, 8) else 1
+    columns = -1 if orientation in (2, 3, 6, 7) else 1
+    return np.ascontiguousarray(across[::rows, ::columns])
 
 
 def read_tiff(path: Path, hints: Hints) -> Recording:
@@ -94,52 +121,64 @@ def read_tiff(path: Path, hints: Hints) -> Recording:
     found = [path] if path.is_file() else _files(path, ".tif", ".tiff")
     if not found:
         raise FileNotFoundError(f"{path}: holds no .tif or .tiff")
-    counts = [_tiff_pages(file) for file in found]
-    where = [(file, page) for file, count in zip(found, counts, strict=True) for page in range(count)]
+    stacks = [tiff.frames_of(file, hints) for file in found]
+    where = [(file, page) for file, stack in zip(found, stacks, strict=True) for page in stack.pages]
     first = _tiff(*where[0], hints)
-    shape = check_shape(path, (len(where), *first.shape[:2]))
+    shape = check_shape(path, (len(where), *first.pixels.shape[:2]))
 
     def raw(start: int, stop: int) -> Array:
         chosen = where[start:stop]
-        pictures = [_tiff(*place, hints) for place in chosen]
-        return _same_size([file for file, _ in chosen], pictures, first.shape, first.dtype)
+        return _same_kind([file for file, _ in chosen], [_tiff(*place, hints) for place in chosen], first)
 
-    return picture(path, shape, raw, first.dtype, "TIFF", hints)
+    recording = picture(path, shape, raw, first, "TIFF", hints)
+    if len(where) != len(found):
+        gaps.tell_files(found)
+    alone = len(where) == len(found) > 1  # a frame in each file
+    said = "; ".join(filter(None, (recording.reading, stacks[0].said)))
+    return replace(recording, reading=said, times=gaps.of_names(found) if alone else None)
 
 
-def picture(path: Path, shape: tuple[int, int, int], raw: Any, dtype: np.dtype, source: str, hints: Hints) -> Recording:
-    """Return pictures as codes if they are 1-bit or --bits is given, else as light by --transfer.
+def picture(path: Path, shape: tuple[int, int, int], raw: Any, first: Page, source: str, hints: Hints) -> Recording:
+    """Return pictures as codes if they have 1 bit or --bits is given, else as light by --transfer.
 
-    `ValueError` if codes exceed 2^bits - 1, as codes stretched to 0 ... 255 do.
+    Pictures of 2 to 7 bits are codes of their depth unless a transfer curve or a white is given. `ValueError` if codes
+    exceed 2^bits - 1, as codes stretched to 0 ... 255 do.
     """
-    one_bit = dtype.kind == "b"  # then --bits and --stretched have no effect
-    if one_bit or hints.bits is not None:
-        bits = 1 if one_bit else int(hints.bits or 0)
+    meta: dict[str, Any] = {}
+    reading = ""
+    if first.orientation != 1:
+        meta["orientation"] = f"upright: turned by its orientation tag {first.orientation}"
+        reading = f"turned upright by its orientation tag {first.orientation}"
+    one_bit, colour, full = first.depth == 1, first.pixels.ndim == 3, 2**first.depth - 1
+    few = 1 < first.depth < 8 and not colour
+    codes = one_bit or hints.bits is not None or (few and hints.transfer is None and hints.white is None)
+    if codes:  # of one bit, --bits and --stretched have no effect
+        bits = first.depth if one_bit or hints.bits is None else hints.bits
         stretched = not one_bit and hints.stretched
         top = 2**bits - 1
+        if few and hints.bits is None:
+            reading = "; ".join(filter(None, (reading, f"read as codes of {bits} bits, the depth of its pixels")))
 
         def read_codes(start: int, stop: int) -> Array:
             values = raw(start, stop)
             if values.ndim == 4:
                 raise ValueError(f"{path}: colour pictures hold no codes")
             if stretched:
-                return _unstretch(path, values, top, start)
+                return _unstretch(path, values, top, start, full)
             return checked_codes(path, values, bits, start)
 
-        return Recording(shape, read_codes, source, bits)
-    if dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{path}: pixels of {dtype}; 1-, 8- and 16-bit pictures are read")
+        return Recording(shape, read_codes, source, bits, meta=meta, reading=reading)
+    if first.pixels.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{path}: pixels of {first.pixels.dtype}; pictures of up to 16 bits are read")
     transfer = need_transfer(path, hints)
-    full = float(np.iinfo(dtype).max)
-
     white, _ = white_of(path, hints, full)
 
     def marked(start: int, stop: int) -> tuple[Array, Array]:
         values = raw(start, stop)
-        colour = values.ndim == 4
-        return to_luminance(values, transfer, full, colour), reached(values, white, colour)
+        return to_luminance(values, transfer, full, values.ndim == 4), reached(values, white, values.ndim == 4)
 
-    return light_recording(path, shape, marked, source, {"transfer": transfer}, hints, full)
+    found = light_recording(path, shape, marked, source, meta | {"transfer": transfer}, hints, full)
+    return replace(found, reading=reading)
 
 
 def to_luminance(values: Array, transfer: str, top: float, colour: bool) -> Array:
@@ -173,41 +212,55 @@ def grey(light: Array, white: float, transfer: str, bits: int = 8) -> Array:
     return from_linear(light / white, transfer, 2**bits - 1)
 
 
-def _png(path: Path) -> Array:
+def _png(path: Path, codes: bool) -> Page:
+    """Return a PNG in the values that it stores; a palette as its codes, or (not `codes`) in its colours."""
     from PIL import Image
 
     with decoding_errors(path, "PNG"), Image.open(path, formats=["PNG"]) as opened:
         check_shape(path, (1, opened.height, opened.width))
-        if opened.mode in ("RGB", "RGBA", "P", "LA"):
-            if any(str(tile[3]).endswith(";16B") for tile in opened.tile):  # the library keeps the upper 8 bits
-                raise ValueError(
-                    f"{path}: colour of 16 bits per channel would lose 8; store it as TIFF, or with 8 bits"
-                )
-            return np.asarray(opened.convert("RGB"))
-        if opened.mode not in ("1", "L", "I;16", "I"):
-            raise ValueError(f"{path}: pixels of mode {opened.mode}; 1-, 8- and 16-bit pictures are read")
-        pixels = np.asarray(opened)
-        return pixels.astype(np.uint16) if pixels.dtype.kind == "i" or pixels.dtype.itemsize > 1 else pixels
+        with open(path, "rb") as file:
+            header = file.read(26)
+        depth, kind = header[24], header[25]  # IHDR: bits per sample; 0 grey, 2 RGB, 3 palette, 4 and 6 with alpha
+        if depth == 16 and kind != 0:  # the library keeps the upper 8 bits
+            raise ValueError(f"{path}: colour of 16 bits per channel would lose 8; store it as TIFF, or with 8 bits")
+        tag = int(opened.getexif().get(ORIENTATION_TAG, 1))
+        tag = tag if tag in ORIENTATIONS else 1
+        if kind == 3 and codes:
+            pixels = _palette_codes(path, opened, depth)
+        elif kind != 0:
+            pixels, depth = np.asarray(opened.convert("RGB")), 8
+        else:
+            pixels = np.asarray(opened)
+            if depth == 16:
+                pixels = pixels.astype(np.uint16)
+            elif depth in (2, 4):  # the library stretches them to 0 ... 255
+                pixels = pixels // (255 // (2**depth - 1))
+        return Page(turned(pixels.astype(bool) if depth == 1 else pixels, tag), depth, tag)
 
 
-def _tiff_pages(path: Path) -> int:
-    """Return the number of pages; `ValueError` if frames lie behind them that no page describes."""
-    import tifffile
+def _palette_codes(path: Path, opened: Any, depth: int) -> Array:
+    """Return the codes [H, W] of a picture with a palette: its greys, or the indices of a palette of colours."""
+    numbers = np.asarray(opened)
+    palette = np.zeros((256, 3), np.uint8)
+    stored = np.array(opened.getpalette("RGB"), np.uint8).reshape(-1, 3)
+    palette[: len(stored)] = stored
+    used = np.unique(numbers)
+    greys = palette[used]
+    if not (greys == greys[:, :1]).all() or (palette[used, 0] == used).all():
+        return numbers
+    top = 2**depth - 1
+    if (palette[used, 0].astype(int) * top % 255).any():
+        raise ValueError(
+            f"{path}: the greys of its palette are not {top + 1} even steps, so they are no codes of {depth} bits; "
+            "save it without a palette"
+        )
+    return (palette[:, 0].astype(int) * top // 255).astype(np.uint8)[numbers]
 
-    with decoding_errors(path, "TIFF"), tifffile.TiffFile(path) as opened:
-        count = len(opened.pages)  # the library refuses a chain of pages in a circle
-        own = not (opened.is_ome or opened.is_micromanager)  # these name further files, which are not opened
-        if opened.is_shaped or (opened.is_imagej and own):
-            frame = math.prod(opened.pages.first.shape)
-            if any(math.prod(series.shape) > count * frame for series in opened.series):
-                raise ValueError(
-                    f"{path}: holds more frames than the {count} that its pages describe, as large stacks of ImageJ "
-                    "do; save it with a page for each frame, or as a folder of TIFFs"
-                )
-        return count
+
+ORIENTATION_TAG = 274  # of TIFF and EXIF
 
 
-def _tiff(path: Path, page: int, hints: Hints) -> Array:
+def _tiff(path: Path, page: int, hints: Hints) -> Page:
     import tifffile
 
     with decoding_errors(path, "TIFF"), tifffile.TiffFile(path) as opened:
@@ -217,44 +270,39 @@ def _tiff(path: Path, page: int, hints: Hints) -> Array:
         codes = kind == tifffile.PHOTOMETRIC.PALETTE and hints.bits is not None  # stacks of ImageJ have a colour table
         if not (kind in _GREY_OR_RGB or codes or (kind == tifffile.PHOTOMETRIC.YCBCR and packed in _JPEG)):
             raise ValueError(f"{path}: page {page} holds {getattr(kind, 'name', kind)} pixels; save it as grey or RGB")
-        promised, there = found.nbytes, path.stat().st_size
-        if promised > 1032 * there or (found.compression == 1 and found.bitspersample >= 8 and promised > there):
-            raise ValueError(f"{path}: page {page} states {promised} bytes, the file has {there}")
-        if float(np.prod(found.chunks, dtype=float)) > max(MAX_PIXELS, 4 * found.imagelength * found.imagewidth):
-            raise ValueError(
-                f"{path}: page {page} is stored in tiles of {list(found.chunks)} pixels, too large to read"
-            )
-        pixels: Array = found.asarray()
+        tiff.check_size_of(path, page, found)
+        pixels: Array = tiff.decoded(path, page, found)
         size = (found.imagelength, found.imagewidth)
         if pixels.shape not in (size, (*size, 3), (*size, 4)):
             raise ValueError(
                 f"{path}: page {page} is {list(pixels.shape)}; grey or colour pictures [H, W(, 3)] are read"
             )
-        if found.bitspersample == 1:
+        depth = int(found.bitspersample)
+        if depth == 1:
             pixels = pixels.astype(bool)
         if found.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
-            pixels = ~pixels if pixels.dtype == bool else np.iinfo(pixels.dtype).max - pixels
+            pixels = ~pixels if pixels.dtype == bool else (2**depth - 1) - pixels
         if pixels.ndim == 3 and pixels.shape[2] > 3:
             pixels = pixels[..., :3]
-        return pixels
+        tag = found.tags.get(ORIENTATION_TAG)
+        orientation = int(tag.value) if tag is not None and tag.value in ORIENTATIONS else 1
+        return Page(turned(pixels, orientation), depth, orientation)
 
 
-def _same_size(paths: list[Path], images: list[Array], shape: tuple[int, ...], dtype: np.dtype) -> Array:
+def _same_kind(paths: list[Path], images: list[Page], first: Page) -> Array:
     for path, image in zip(paths, images, strict=True):
-        if image.shape != shape or image.dtype != dtype:
-            raise ValueError(
-                f"{path}: {image.dtype} {list(image.shape)}, but the first picture is {dtype} {list(shape)}"
-            )
-    return np.stack(images)
+        if image.kind != first.kind:
+            raise ValueError(f"{path}: {image.kind}, but the first picture is {first.kind}")
+    return np.stack([image.pixels for image in images])
 
 
-def _unstretch(path: Path, values: Array, top: int, first: int) -> Array:
-    found = np.rint(values.astype(np.float64) * top / 255).astype(np.uint8 if top < 256 else np.uint16)
-    back = np.rint(found.astype(np.float64) * 255 / top)
+def _unstretch(path: Path, values: Array, top: int, first: int, full: int) -> Array:
+    found = np.rint(values.astype(np.float64) * top / full).astype(np.uint8 if top < 256 else np.uint16)
+    back = np.rint(found.astype(np.float64) * full / top)
     if (back != values).any():
         t, y, x = (int(i) for i in np.argwhere(back != values)[0])
         raise ValueError(
             f"{path}: value {int(values[t, y, x])} at (t, y, x) = ({first + t}, {y}, {x}) is not a code 0..{top} "
-            "stretched to 0..255: the pictures were compressed with loss; use lossless ones"
+            f"stretched to 0..{full}: the pictures were compressed with loss; use lossless ones"
         )
     return found

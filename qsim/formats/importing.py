@@ -25,6 +25,7 @@ from qsim.clip.manifest import RELATIVE, check_outside
 from qsim.clip.stream import Stream, write_packed
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
+from qsim.formats import gaps
 from qsim.formats.detection import ASSUMED, LAYOUTS, detect
 from qsim.formats.recording import Hints, Marked, Recording, reoriented, with_stated_layout
 from qsim.sensor import colour_filter, devices, packing
@@ -47,6 +48,7 @@ def read(path: Path, hints: Hints | None = None, *, compared: tuple[str, ...] = 
         raise FileNotFoundError(f"{path}: no such file")
     asked = {"layout", "flip", "columns", *compared}
     recording = LAYOUTS[layout](path, cast(Hints, _Watched(hints, asked)))
+    asked |= {"keep_gaps"} if recording.times is not None else set()
     for field in fields(Hints):
         given = getattr(hints, field.name) != field.default
         if given and field.name not in asked:
@@ -55,7 +57,7 @@ def read(path: Path, hints: Hints | None = None, *, compared: tuple[str, ...] = 
             )
     if layout in ASSUMED:
         recording = with_stated_layout(recording, *ASSUMED[layout])
-    return reoriented(recording, hints)
+    return gaps.told(path, reoriented(recording, hints), hints.keep_gaps)
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ def to_clip(
         "source": {"format": recording.source} | recording.meta,
         "split": capture.split,
         "saturation": {"white": recording.white, "assumed": recording.white_assumed},
-    }
+    } | _times_of(recording)
     marked = recording.marked or _unmarked(recording)
     with ClipWriter(path, meta, force=force) as writer:
         for start, stop in _ranges(recording):
@@ -143,7 +145,8 @@ def _unmarked(recording: Recording) -> Marked:
 def saturation_line(clip: Clip) -> str:
     """Return a line about the saturation of an imported clip: its white and the share of saturated pixels."""
     known = clip.meta.get("saturation") or {"white": None, "assumed": True}
-    white, count = known["white"], int(clip.meta.get("saturated_pixels") or 0)
+    missing = len((clip.meta.get("source") or {}).get("missing_frames", ()))
+    white, count = known["white"], int(clip.meta.get("saturated_pixels") or 0) - missing * math.prod(clip.shape[1:])
     share = f"{100 * count / math.prod(clip.shape):.3g} % of pixels"
     cut = f"; light above {exr.HALF_MAX:g}, the most a clip holds, is cut off and counts as saturated: {share}"
     if white is None:
@@ -217,8 +220,13 @@ def to_stream(
         "transfer": "linear",
         "seed": None,
         "source": {"format": recording.source} | recording.meta,
-    }
+    } | _times_of(recording)
     return write_packed(npy, packed(), sensor, meta | tables)
+
+
+def _times_of(recording: Recording) -> dict[str, Any]:
+    """Return the table `times` of a description, if the source states when each frame was taken."""
+    return {} if recording.times is None else {"times": recording.times.to_dict()}
 
 
 def _as_stated(path: Path, recording: Recording, capture: Import) -> Import:

@@ -22,6 +22,7 @@ from numpy import ndarray as Array
 from qsim import checks
 from qsim.checks import check_shape
 from qsim.file_order import numbered
+from qsim.formats import gaps
 from qsim.formats.recording import Hints, Recording, check_size, values_recording
 
 LARGEST_SIDE_FILE = 1 << 20  # bytes of a .cihx
@@ -299,6 +300,7 @@ def raw_files(path: Path) -> list[Path]:
     found = numbered(list(path.rglob("*.bin")), below=path)
     if not found:
         raise FileNotFoundError(f"{path}: no such file, or a folder without .bin files")
+    gaps.tell_files(found)
     return found
 
 

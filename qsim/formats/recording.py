@@ -27,6 +27,7 @@ class Times:
     values: tuple[float, ...]  # rising
     unit: str  # s, or frames for numbers
     source: str  # what states them, in words
+    tick: float = 0.0  # to which they are rounded
 
     def to_dict(self) -> dict[str, Any]:
         """Return the table `times` of clip.json and of streams."""
@@ -104,7 +105,30 @@ def light_recording(
 ) -> Recording:
     """Return a recording of light; `full` is the largest value of the file's pixels, infinite for floats."""
     white, assumed = white_of(path, hints, full)
+    if hints.black is not None:
+        marked = _without_black(path, marked, hints.black, meta["transfer"], full)
+        meta = meta | {"black": hints.black}
     return Recording(shape, lambda a, b: marked(a, b)[0], source, None, "", meta, marked, white, assumed)
+
+
+def _without_black(path: Path, marked: Marked, black: float, transfer: str, full: float) -> Marked:
+    """Return linear light without the pixel value of darkness; what was darker becomes 0.
+
+    Pixels of whole numbers, of which `full` is the largest, are light of 0 ... 1 again; floats keep their unit.
+    """
+    if transfer != "linear":
+        raise ValueError(f"{path}: --black acts on linear pixels, and --transfer is {transfer}; leave it out")
+    if not black < full:
+        raise ValueError(f"{path}: --black {black:g}: expected less than the largest value {full:g}")
+    floats = full == float("inf")
+    dark = np.float32(black if floats else black / full)
+    gain = np.float32(1.0 if floats else full / (full - black))
+
+    def subtracted(start: int, stop: int) -> tuple[Array, Array]:
+        light, mask = marked(start, stop)
+        return np.maximum(light - dark, 0) * gain, mask
+
+    return subtracted
 
 
 def values_recording(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from qsim.formats.images import to_luminance
 from qsim.formats.recording import (
     Hints,
     Recording,
+    Times,
     light_recording,
     need_transfer,
     reached,
@@ -39,9 +41,11 @@ def read_video(path: Path, hints: Hints) -> Recording:
     """
     transfer = need_transfer(path, hints)
     with decoding_errors(path, "video"):
-        frames, height, width, full = _video_shape(path)
-    shape = check_shape(path, (frames, height, width))
-    decoder = _Decoder(path, (height, width), full)
+        about = _video_facts(path)
+    full = about.full
+    check_shape(path, (about.frames, about.height, about.width))
+    shape = (about.frames, *(about.size if about.turn is None else about.turn.size(*about.size)))
+    decoder = _Decoder(path, about)
 
     white, _ = white_of(path, hints, full)
 
@@ -51,7 +55,13 @@ def read_video(path: Path, hints: Hints) -> Recording:
             light = np.stack([to_luminance(f, transfer, full, f.ndim == 3) for f in found])
             return light, np.stack([reached(f, white, f.ndim == 3) for f in found])
 
-    return light_recording(path, shape, marked, "video", {"transfer": transfer}, hints, full)
+    meta = {"transfer": transfer}
+    reading = ""
+    if about.turn is not None:
+        meta["orientation"] = f"upright: {about.turn.said}"
+        reading = about.turn.said
+    found = light_recording(path, shape, marked, "video", meta, hints, full)
+    return replace(found, reading=reading, times=about.times)
 
 
 def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossless: bool) -> None:
@@ -84,24 +94,25 @@ def read_frames(path: Path) -> Iterator[Array]:
     `ValueError` for a video of more bits.
     """
     with decoding_errors(path, "video"):
-        _, height, width, full = _video_shape(path)
-        check_shape(path, (1, height, width))
-        if full > 255:
+        about = _video_facts(path)
+        check_shape(path, (1, about.height, about.width))
+        if about.full > 255:
             raise ValueError(f"{path}: pixels of more than 8 bits")
-        yield from _decoded(path, (height, width), full)
+        yield from _decoded(path, about)
 
 
 class _Decoder:
     """Decodes frames in order; an earlier frame starts again at the first."""
 
-    def __init__(self, path: Path, size: tuple[int, int], full: int) -> None:
-        self.path, self.size, self.full = path, size, full
+    def __init__(self, path: Path, about: Facts) -> None:
+        self.path, self.about = path, about
         self.next = 0
         self.source: Iterator[Array] | None = None
 
     def frames(self, start: int, stop: int) -> list[Array]:
         if self.source is None or start < self.next:
-            self.source, self.next = _decoded(self.path, self.size, self.full), 0
+            self.source = _decoded(self.path, self.about)
+            self.next = 0
         found = []
         while self.next < stop:
             frame = next(self.source, None)
@@ -115,7 +126,13 @@ class _Decoder:
         return found
 
 
-def _decoded(path: Path, size: tuple[int, int], full: int) -> Iterator[Array]:
+def _decoded(path: Path, about: Facts) -> Iterator[Array]:
+    """Yield the frames upright."""
+    for frame in _stored(path, about.size, about.full):
+        yield frame if about.turn is None else about.turn(frame)
+
+
+def _stored(path: Path, size: tuple[int, int], full: int) -> Iterator[Array]:
     with _open_video(path) as container:
         for frame in container.decode(video=0):
             if (frame.height, frame.width) != size or _full(path, frame.format) != full:
@@ -156,8 +173,49 @@ def _open_video(path: Path) -> Any:
     return container
 
 
-def _video_shape(path: Path) -> tuple[int, int, int, int]:
-    """Return frames, height, width, and the largest value of a pixel."""
+@dataclass(frozen=True)
+class Turn:
+    """A display matrix of quarter turns and mirrors: stored (x, y) is shown at (a x + c y, b x + d y)."""
+
+    a: int
+    b: int
+    c: int
+    d: int
+
+    @property
+    def said(self) -> str:
+        return f"turned as its display matrix states ({self.a}, {self.b}; {self.c}, {self.d})"
+
+    def size(self, height: int, width: int) -> tuple[int, int]:
+        return (width, height) if self.a == 0 else (height, width)
+
+    def __call__(self, pixels: Array) -> Array:
+        """Return a frame [H, W(, 3)] as it is shown."""
+        if self.a == 0:
+            found = pixels.swapaxes(0, 1)[:: self.b, :: self.c]
+        else:
+            found = pixels[:: self.d, :: self.a]
+        return np.ascontiguousarray(found)
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a video file states, its frames counted."""
+
+    frames: int
+    height: int
+    width: int
+    full: int  # largest value of a pixel
+    times: Times | None
+    turn: Turn | None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.height, self.width
+
+
+def _video_facts(path: Path) -> Facts:
+    """Return what the file states; a cut off or unsized packet is no frame."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     with _open_video(path) as container:
@@ -166,5 +224,25 @@ def _video_shape(path: Path) -> tuple[int, int, int, int]:
         stream = container.streams.video[0]
         height, width = stream.codec_context.height, stream.codec_context.width
         full = _full(path, stream.codec_context.format)
-        frames = sum(1 for packet in container.demux(stream) if packet.size and not packet.is_discard)  # cut off
-    return frames, height, width, full
+        packets = [packet for packet in container.demux(stream) if packet.size and not packet.is_discard]
+        stamps = sorted(packet.pts for packet in packets if packet.pts is not None)
+        base = float(stream.time_base) if stream.time_base is not None else 0.0
+    times = None
+    if len(stamps) == len(packets) and base > 0 and len(set(stamps)) == len(stamps):
+        times = Times(tuple(stamp * base for stamp in stamps), "s", "presentation times of the video", base)
+    return Facts(len(packets), height, width, full, times, _turn(path) if packets else None)
+
+
+def _turn(path: Path) -> Turn | None:
+    """Return how the first frame is to be turned; `ValueError` for an angle that is no quarter of a turn."""
+    with _open_video(path) as container:
+        frame = next(container.decode(video=0), None)
+        data = None if frame is None else frame.side_data.get("DISPLAYMATRIX")
+        if data is None:
+            return None
+        numbers = np.frombuffer(bytes(data), np.int32)[[0, 1, 3, 4]]
+    parts = np.rint(numbers / 65536).astype(int)
+    if np.abs(numbers / 65536 - parts).max() > 1e-3 or abs(int(parts[0] * parts[3] - parts[1] * parts[2])) != 1:
+        raise ValueError(f"{path}: its display matrix turns by no quarter of a turn; encode it again without it")
+    found = Turn(*(int(part) for part in parts))
+    return None if found == Turn(1, 0, 0, 1) else found

@@ -96,7 +96,8 @@ def test_a_stack_behind_a_single_page_is_refused(tmp_path: Path, imagej: bool):
 
     frames = np.random.default_rng(0).integers(0, 256, (5, 9, 7)).astype(np.uint8)
     for truncate in (False, True):
-        tifffile.imwrite(tmp_path / "a.tif", frames, imagej=imagej, truncate=truncate, photometric="minisblack")
+        tifffile.imwrite(tmp_path / "a.tif", frames, imagej=imagej, truncate=truncate, photometric="minisblack",
+                         metadata={"axes": "TYX"})  # fmt: skip
         if truncate:
             with pytest.raises(ValueError, match=r"a\.tif: holds more frames than the 1 that its pages describe"):
                 importing.read(tmp_path / "a.tif", Hints(bits=8))
@@ -143,3 +144,90 @@ def test_tiff_of_other_colours_is_not_read_as_grey_or_rgb(tmp_path: Path):
     with pytest.raises(ValueError, match=r"a\.tif: page 0 holds PALETTE pixels; save it as grey or RGB"):
         everything(path, transfer="srgb")
     np.testing.assert_array_equal(everything(path, bits=8)[0], pixels[..., 0])
+
+
+@pytest.mark.parametrize("depth", [1, 2, 4])
+@pytest.mark.parametrize("kind", ["grey", "ramp", "shuffled", "colours"])
+def test_few_bit_pictures_hold_their_codes(tmp_path: Path, kind: str, depth: int):
+    """Palettes were refused, and grey of 2 or 4 bits was stretched to 0 ... 255: 17 times too large."""
+    rng = np.random.default_rng(depth)
+    top = 2**depth - 1
+    codes = rng.integers(0, top + 1, (7, 11)).astype(np.uint8)
+    write_few_bits(tmp_path / "a.png", codes, depth, kind, rng)
+    np.testing.assert_array_equal(everything(tmp_path / "a.png", **({} if depth == 1 else {"bits": depth}))[0], codes)
+    if kind != "colours" and depth > 1:
+        assert importing.read(tmp_path / "a.png").bits == depth
+        light = importing.read(tmp_path / "a.png", Hints(transfer="linear"))
+        np.testing.assert_allclose(light.read(0, 1)[0], codes / top, rtol=1e-6)
+
+
+def write_few_bits(path: Path, codes: np.ndarray, depth: int, kind: str, rng: np.random.Generator) -> None:
+    """A PNG by the standard: grey of a depth, or a palette whose entry shows the code, in order or shuffled."""
+    import struct
+    import zlib
+
+    top = 2**depth - 1
+    order = rng.permutation(top + 1) if kind == "shuffled" else np.arange(top + 1)  # code of each index
+    stored = np.argsort(order)[codes]
+    bits = np.unpackbits(stored.astype(np.uint8)[..., None], axis=-1)[..., 8 - depth :].reshape(len(codes), -1)
+    rows = b"".join(b"\0" + np.packbits(row).tobytes() for row in bits)
+    greys = (order * (255 // top)).astype(np.uint8)
+    colours = np.stack([greys, greys, greys if kind != "colours" else 255 - greys], axis=1)
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+    header = struct.pack(">IIBBBBB", codes.shape[1], codes.shape[0], depth, 0 if kind == "grey" else 3, 0, 0, 0)
+    parts = [chunk(b"IHDR", header)]
+    parts += [] if kind == "grey" else [chunk(b"PLTE", colours.tobytes())]
+    parts += [chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+
+
+@pytest.mark.parametrize("kind", ["tif", "png"])
+def test_orientation_tags_are_applied(tmp_path: Path, kind: str):
+    """The right answer is Pillow's transposition of a picture with the tag."""
+    import tifffile
+    from PIL import Image, ImageOps
+
+    pixels = np.random.default_rng(0).integers(0, 256, (5, 8)).astype(np.uint8)
+    for tag in range(1, 9):
+        path = tmp_path / f"{tag}.{kind}"
+        exif = Image.Exif()
+        exif[274] = tag
+        if kind == "tif":
+            tifffile.imwrite(path, pixels, extratags=[(274, "H", 1, tag, True)])
+        else:
+            Image.fromarray(pixels).save(path, exif=exif)
+        shown = Image.fromarray(pixels)
+        shown.getexif()[274] = tag
+        expected = np.asarray(ImageOps.exif_transpose(shown))
+        recording = importing.read(path, Hints(bits=8))
+        np.testing.assert_array_equal(recording.read(0, 1)[0], expected)
+        assert recording.meta["orientation"] == (
+            "upright" if tag == 1 else f"upright: turned by its orientation tag {tag}"
+        )
+
+
+def test_tiff_that_needs_a_decoder_names_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A 12-bit packed file was called truncated. Its bytes: two pixels in three, highest bit first."""
+    import struct
+    import sys
+
+    pixels = np.array([[0x123, 0xABC], [0xFFF, 0x000]])
+    content = bytes([0x12, 0x3A, 0xBC, 0xFF, 0xF0, 0x00])
+    tags = [(256, 3, 1, 2), (257, 3, 1, 2), (258, 3, 1, 12), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, 8),
+            (277, 3, 1, 1), (278, 3, 1, 2), (279, 4, 1, 6)]  # fmt: skip
+    table = b"".join(struct.pack("<HHII", *tag) for tag in tags)
+    head = struct.pack("<2sHI", b"II", 42, 14) + content
+    (tmp_path / "a.tif").write_bytes(head + struct.pack("<H", len(tags)) + table + bytes(4))
+    recording = importing.read
+    try:
+        import imagecodecs  # noqa: F401
+    except ImportError:
+        with pytest.raises(ValueError, match=r"12-bit pixels, which the package imagecodecs decodes: pip install"):
+            recording(tmp_path / "a.tif", Hints(transfer="linear"))
+        return
+    found = recording(tmp_path / "a.tif", Hints(transfer="linear"))
+    np.testing.assert_allclose(found.read(0, 1)[0], pixels / 4095, rtol=1e-6)
+    monkeypatch.setitem(sys.modules, "imagecodecs", None)

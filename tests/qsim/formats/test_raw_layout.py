@@ -30,7 +30,7 @@ def stream_of_bits(pixels: list[int], bits: int, order: str) -> bytes:
 def raw_bytes(frames: np.ndarray, kind: str, bits: int, first: str, skip: int, padding: int | None) -> bytes:
     found = bytes(range(skip))
     for frame in frames.tolist():
-        for row in [[pixel for row in frame for pixel in row]] if padding is None else frame:
+        for row in [[pixel for line in frame for pixel in line]] if padding is None else frame:
             if kind == "packed":
                 found += stream_of_bits(row, bits, first)
             else:

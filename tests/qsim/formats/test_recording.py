@@ -103,6 +103,10 @@ def sample(folder: Path, layout: str) -> tuple[Path, Hints]:
         first, kind = np.arange(257), np.ones(256, np.uint8)  # one photon for each pixel
         text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         np.savez(path, times=np.linspace(0, 1.9e-3, 256), kind=kind, first=first, meta=text)
+    elif layout == "hdf5":
+        path = folder / "a.h5"
+        with pytest.importorskip("h5py").File(path, "w") as file:
+            file["entry/data"] = planes_.astype(bool)
     elif layout == "mraw":
         path = folder / "a.mraw"
         path.write_bytes(bytes(2 * 16 * 16))
