@@ -10,16 +10,16 @@ choice therefore does not bias the Fano factor.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from math import sqrt
+from math import inf
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.calibration.frame_statistics import FrameStatistics, alike, as_codes, measure
-from qsim.calibration.results import Calibration, Value, normal_interval
-from qsim.sensor.counting import CountingSPAD
+from qsim.calibration.results import Z95, Calibration, Value, normal_interval
+from qsim.calibration.spad_response import Response
 
 CLASSES = 8
 LEAST_MEAN = 1.0  # counts; darker pixels hold no information about dead time
@@ -30,18 +30,47 @@ _BLOCK = 1 << 22  # values that are checked at a time
 
 @dataclass(frozen=True)
 class Ratio:
-    """Dead time in exposures, and its variance."""
+    """Dead time in exposures, with a 95 % interval; `high` is infinite where the counts bound it on one side only."""
 
     value: float
-    variance: float
+    low: float
+    high: float
+    ceiling: float  # largest dead time with which light gives the flats' means
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The smallest and the largest dead time that may be."""
+        return self.low, min(self.high, self.ceiling)
 
 
-def fitted_dead_time(flats: Sequence[FrameStatistics], bits: int, paralyzable: bool) -> Ratio | None:
+@dataclass(frozen=True)
+class Pooled:
+    """Moments of the good pixels of one flat."""
+
+    mean: float  # codes
+    variance: float  # codes^2, in time
+    fixed_pattern: float  # codes^2, between the pixels' expected codes
+    pixels: int
+    frames: int
+    exposure: float  # s
+
+    @classmethod
+    def of(cls, stack: FrameStatistics, good: Array | None = None) -> Pooled:
+        """Return the moments of the pixels in `good`, bool [H, W]; None: of all."""
+        kept = np.ones(stack.total.shape, bool) if good is None else good
+        means = stack.total[kept] / stack.frames
+        variance = float(stack.pixel_variance[kept].mean())
+        pattern = float(means.var(ddof=1)) - variance / stack.frames if means.size > 1 else 0.0
+        return cls(float(means.mean()), variance, pattern, means.size, stack.frames, stack.exposure)
+
+
+def fitted_dead_time(flats: Sequence[Pooled], response: Response) -> Ratio | None:
     """Fit tau/T to the variance over time of every flat against its mean; None without a usable flat.
 
-    The fit is a weighted least squares on exact moments. `ValueError` if the flats have different exposures.
+    The fit is a least squares on exact moments, with the afterpulses and crosstalk of `response`; its interval is that
+    of the profile. `ValueError` if the flats have different exposures.
     """
-    from scipy.optimize import minimize_scalar
+    from scipy.optimize import brentq, minimize_scalar
 
     usable = [flat for flat in flats if flat.frames > 1 and flat.mean > 0]
     if not usable:
@@ -50,71 +79,95 @@ def fitted_dead_time(flats: Sequence[FrameStatistics], bits: int, paralyzable: b
         raise ValueError("calibrate: the flats have different exposures; give dead-time flats of one exposure")
 
     def misfit(ratio: float) -> float:
-        return float(sum(r * r for r in _fano_residuals(usable, bits, ratio, paralyzable)))
+        return float((fano_residuals(usable, replace(response, ratio=ratio)) ** 2).sum())
 
     # A pixel counts at most about T/tau, or T/(e tau) if every arrival blocks it: the largest mean bounds the ratio.
-    ceiling = min((0.45 if paralyzable else 0.9) / max(flat.mean for flat in usable), 2.0)
-    found = minimize_scalar(misfit, bounds=(0.0, ceiling), method="bounded", options={"xatol": 1e-9})
+    ceiling = min((0.45 if response.paralyzable else 0.9) / max(flat.mean for flat in usable), 2.0)
+    # Near the bound no light gives the mean, and the misfit is flat: a local search starts from the best of a few.
+    steps = ceiling * np.linspace(0, 1, 9) ** 2
+    place = int(np.argmin([misfit(step) for step in steps]))
+    bounds = (steps[max(place - 1, 0)], steps[min(place + 1, 8)])
+    found = minimize_scalar(misfit, bounds=bounds, method="bounded", options={"xatol": 1e-9})
     ratio = float(found.x) if misfit(float(found.x)) < misfit(0.0) else 0.0
-    step = max(ratio * 1e-3, 1e-7)
-    slope = [
-        (a - b) / step
-        for a, b in zip(
-            _fano_residuals(usable, bits, ratio + step, paralyzable),
-            _fano_residuals(usable, bits, ratio, paralyzable),
-            strict=True,
-        )
-    ]
-    return Ratio(ratio, 1 / max(float(np.dot(slope, slope)), 1e-300))
+    limit = misfit(ratio) + Z95**2
+
+    def edge(end: float) -> float | None:
+        return float(brentq(lambda x: misfit(x) - limit, ratio, end, xtol=1e-10)) if misfit(end) > limit else None
+
+    high = edge(ceiling)
+    return Ratio(ratio, edge(0.0) or 0.0, inf if high is None else high, ceiling)
 
 
-def _fano_residuals(flats: Sequence[FrameStatistics], bits: int, ratio: float, paralyzable: bool) -> list[float]:
-    """Return (observed variance - variance of dead-time pixels of the same mean) / sigma, per flat.
+def moved_ratio(flats: Sequence[Pooled], response: Response, moved: Response) -> float:
+    """Return the dead time of the least squares for `moved`, near that of `response`, to first order."""
+    step = max(1e-3 * response.ratio, 1e-5)
+    base, by_ratio, by_move = (
+        fano_residuals(flats, law) for law in (response, replace(response, ratio=response.ratio + step), moved)
+    )
+    slope = (by_ratio - base) / step
+    change = -float(slope @ (by_move - base)) / max(float(slope @ slope), 1e-300)
+    return float(np.clip(response.ratio + change, 0.0, 2 * response.ratio + step))
+
+
+def fano_residuals(flats: Sequence[Pooled], response: Response) -> Array:
+    """Return (observed variance - variance of dead-time pixels of the same mean) / sigma, [flat].
 
     The variance bends with the mean, so a spread of light between the pixels changes its average to second order.
     Sigma comes from the model's moments: those of the data would count the pattern of the pixels as noise.
     """
-    residuals = []
-    codes = np.arange(1 << bits, dtype=float)
-    sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
-    for flat in flats:
-        arrivals, expected, slope, bend = matched_variance(flat.mean, bits, ratio, paralyzable)
-        pmf = np.exp(sensor.log_pmf(np.array(arrivals), 1.0))
-        centred = codes - pmf @ codes
-        third, fourth = float(pmf @ centred**3), float(pmf @ centred**4)
-        v = max(expected, 1e-12)
-        n = flat.pixels * (flat.frames - 1)
-        noise = max(fourth - v**2 + slope**2 * v - 2 * slope * third, 1e-12) / n
-        if flat.pixels > 1:
-            expected += bend / 2 * min(flat.fixed_pattern, (flat.mean / 2) ** 2)
-        residuals.append((flat.variance - expected) / sqrt(noise))
-    return residuals
+    mean, observed, pattern, pixels, frames = np.array(
+        [(flat.mean, flat.variance, flat.fixed_pattern, flat.pixels, flat.frames) for flat in flats]
+    ).T
+    matched = matched_variance(mean, response)
+    pmf = response.pmf(matched.arrivals)
+    codes = np.arange(response.levels, dtype=float)
+    centred = codes - (pmf @ codes)[:, None]
+    third = (pmf * centred**3).sum(axis=1)
+    fourth = (pmf * centred**4).sum(axis=1)
+    v = np.maximum(matched.variance, 1e-12)
+    noise = fourth - v**2 + matched.slope**2 * v - 2 * matched.slope * third
+    expected = matched.variance + matched.bend / 2 * np.minimum(pattern, (mean / 2) ** 2)
+    # Afterpulses vary the mean over the frames, which the variance about it leaves out.
+    expected = expected * (1 - (response.excess(mean) - 1) / np.maximum(frames - 1, 1))
+    return np.asarray((observed - expected) / np.sqrt(np.maximum(noise, 1e-12) / (pixels * (frames - 1))))
 
 
-def matched_variance(mean: float, bits: int, ratio: float, paralyzable: bool) -> tuple[float, float, float, float]:
-    """Return arrivals and variance of a counting pixel of this mean code, and the variance's two derivatives by it.
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """Arrivals and variance of counting pixels of given mean codes, and the variance's two derivatives by the mean."""
 
-    tau/T = `ratio`. Newton's method on the rising branch. If no light gives this mean, the variance is 0, which no data
-    match.
+    arrivals: Array
+    variance: Array
+    slope: Array
+    bend: Array
+
+
+def matched_variance(mean: Array, response: Response) -> Matched:
+    """Return the light and the variance of pixels of mean codes [p].
+
+    Newton's method on the rising branch. If no light gives this mean, the variance is 0, which no data match.
     """
-    sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
-    arrivals = mean
+    start = mean if response.paralyzable else mean / np.maximum(1 - mean * response.ratio, 0.2)
+    arrivals = np.array(start, float)
+    steep = np.ones(arrivals.shape, bool)
     for _ in range(40):
-        at = np.array(arrivals)
-        slope = -float(np.sum(sensor.dcdf(at, 1.0)[:-1]))
-        excess = float(sensor.mean(at, 1.0)) - mean
-        if slope < 0.02:  # the mean is near its maximum or falls: no light gives it with this dead time
-            return arrivals, 0.0, 0.0, 0.0
-        step = float(np.clip(excess / slope, -0.5 * arrivals - 0.1, 0.5 * arrivals))
-        arrivals -= step
-        if abs(step) < 1e-9 * max(arrivals, 1e-6):
+        h = 1e-4 * np.maximum(arrivals, 1e-4)
+        below, at, above = response.mean(np.stack([arrivals - h, arrivals, arrivals + h]))
+        slope = (above - below) / (2 * h)
+        steep = slope >= 0.02  # else the mean is near its maximum or falls: no light gives it with this dead time
+        step = np.clip((at - mean) / np.where(steep, slope, 1.0), -0.5 * arrivals - 0.1, 0.5 * arrivals)
+        step = np.where(steep, step, 0.0)
+        arrivals = arrivals - step
+        if (np.abs(step) < 1e-9 * np.maximum(arrivals, 1e-6)).all():
             break
-    h = 1e-3 * max(arrivals, 1e-4)
-    at = np.array([arrivals - h, arrivals, arrivals + h])
-    variance, means = sensor.variance(at, 1.0), sensor.mean(at, 1.0)
-    below, above = np.diff(variance) / np.diff(means)
-    bend = 2 * float(above - below) / float(means[2] - means[0])
-    return arrivals, float(variance[1]), float((variance[2] - variance[0]) / (means[2] - means[0])), bend
+    h = 1e-3 * np.maximum(arrivals, 1e-4)
+    near = np.concatenate([arrivals - h, arrivals, arrivals + h])
+    variance, means = (values.reshape(3, -1) for values in (response.variance(near), response.mean(near)))
+    rise = np.where(np.diff(means, axis=0) == 0, 1.0, np.diff(means, axis=0))
+    before, after = np.diff(variance, axis=0) / rise
+    whole = np.where(means[2] == means[0], 1.0, means[2] - means[0])
+    found = (variance[1], (variance[2] - variance[0]) / whole, 2 * (after - before) / whole)
+    return Matched(arrivals, *(np.where(steep, values, 0.0) for values in found))
 
 
 def classes_of(
@@ -176,13 +229,15 @@ def calibrate_static(
         raise ValueError(
             "calibrate: all frames are alike, which determines no dead time; are they copies of one, or saturated?"
         )
-    found = fitted_dead_time(stacks, bits, paralyzable)
+    pooled = [Pooled.of(stack) for stack in stacks]
+    response = Response(bits, 0.0, paralyzable, exposure)
+    found = fitted_dead_time(pooled, response)
     ratio = found.value if found else 0.0
     values = {f"fano_at_{stack.mean:.3g}": fano(stack) for stack in stacks}
-    if found:
-        method = "Fano factor against flux, static scene"
-        values["dead_time"] = normal_interval(ratio * exposure, found.variance * exposure**2, "s", method, floor=0.0)
-    residuals = _fano_residuals(stacks, bits, ratio, paralyzable)
+    if found and found.high < inf:
+        ends = (found.value * exposure, found.low * exposure, found.high * exposure)
+        values["dead_time"] = Value(*ends, "s", "Fano factor against flux, static scene")
+    residuals = fano_residuals(pooled, replace(response, ratio=ratio))
     p_value = _p_value(residuals, fitted=int(ratio > 0))
     warnings: tuple[str, ...] = ()
     if p_value < 1e-3:
@@ -191,9 +246,9 @@ def calibrate_static(
     return Calibration("CountingSPAD", bits, values, p_value, warnings, drawn, paralyzable=paralyzable)
 
 
-def _p_value(residuals: Sequence[float], fitted: int) -> float:
+def _p_value(residuals: Array, fitted: int) -> float:
     """Return the chi-square p-value of the classes' variances against the curve; a dead time of 0 is not fitted."""
     from scipy.stats import chi2
 
     freedom = len(residuals) - fitted
-    return float(chi2.sf(sum(r * r for r in residuals), freedom)) if freedom > 0 else float("nan")
+    return float(chi2.sf(float((residuals**2).sum()), freedom)) if freedom > 0 else float("nan")

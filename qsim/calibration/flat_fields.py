@@ -7,108 +7,113 @@ QIS:  mean codes; dark level of every pixel from the dark frames of the flat's e
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.calibration.frame_statistics import FrameStatistics
-from qsim.calibration.prnu import WIDEST, Flat, hot_by_level, hot_by_rate, surface
-from qsim.sensor.counting import CountingSPAD
+from qsim.calibration.prnu import WIDEST, Flat, hot_by_level, surface
+from qsim.calibration.spad_response import Response
 from qsim.sensor.qis import QIS
+
+LINEAR = 10.0  # counts missing to saturation in a stack, from which on it tells a pixel's dark rate
+_CORRECTABLE = 0.2  # of the standard error: bias of the mean of nearly saturated planes, up to which a flat is used
 
 
 @dataclass(frozen=True, eq=False)
-class Response:
-    """Exact curve of mean code against arrivals of one pixel, with the measured dead time, and its inverse."""
+class DarkRates:
+    """Dark rate of every pixel and its variance, both [H, W], and what finds the hot pixels."""
 
-    bits: int
-    ratio: float  # dead time in exposures of `exposure`; 0 for 1-bit planes
-    paralyzable: bool
-    exposure: float  # s
-
-    def at(self, exposure: float) -> Response:
-        """Return the curve of the same pixel at another exposure [s]."""
-        return replace(self, ratio=self.ratio * (self.exposure / exposure), exposure=exposure)
-
-    def table(self, largest: float) -> tuple[Array, Array]:
-        """Return (arrivals, mean code) [G], rising, up to a mean of `largest` or to the maximum of the mean."""
-        top = 2 * largest + 10
-        for _ in range(12):
-            arrivals = np.linspace(0, np.sqrt(top), 1500) ** 2
-            codes = self.mean(arrivals)
-            end = int(np.argmax(codes))
-            if codes[end] >= largest or end < len(codes) - 1:
-                break
-            top *= 2
-        return arrivals[: end + 1], codes[: end + 1]
-
-    def mean(self, arrivals: Array) -> Array:
-        """Return the exact expected code at arrivals per exposure, any shape."""
-        if self.bits == 1:
-            return -np.expm1(-arrivals)
-        return CountingSPAD(1.0, 0.0, self.ratio, self.bits, self.paralyzable).mean(arrivals, 1.0)
-
-    def of_stack(self, stack: FrameStatistics) -> tuple[Array, Array, float]:
-        """Return arrivals per exposure of every pixel and their variance, both [H, W], and d code / d arrivals.
-
-        The bias of a curved inverse, f''/2 times the variance of the pixel's mean, is subtracted.
-        """
-        t = stack.frames
-        mean = stack.total / t
-        if self.bits == 1:
-            mean = np.minimum(mean, 1 - 0.5 / t)
-        arrivals, codes = self.at(stack.exposure).table(float(mean.max()))
-        found = np.interp(mean, codes, arrivals)
-        at = np.interp(stack.mean, codes, arrivals)
-        slope_table = np.gradient(codes, arrivals)
-        slope = float(np.interp(at, arrivals, slope_table))
-        variance = np.where(stack.pixel_variance > 0, stack.pixel_variance, 0.0) if t > 1 else mean
-        slopes = np.interp(found, arrivals, slope_table)
-        curvature = np.interp(found, arrivals, np.gradient(slope_table, arrivals))
-        found = found + 0.5 * curvature / slopes**3 * variance / t
-        return np.maximum(found, 0.0), variance / (t * slopes**2), slope
+    rate: Array  # [H, W] 1/s; noise may make it negative
+    variance: Array  # [H, W]
+    counts: Array  # [H, W] detections in `time`, less afterpulses and crosstalk
+    time: float  # s of all stacks
+    saturated: Array  # bool [H, W]: no stack has a frame below the top code, so the rate is a lower limit
+    missing: Array  # [H, W] counts below saturation, in the stack that tells the pixel's rate best
+    frames: Array  # [H, W] frames of that stack, and its exposure
+    exposure: Array
 
 
-def dark_rates(darks: Sequence[FrameStatistics], response: Response) -> tuple[Array, Array]:
-    """Return the DCR of every pixel [1/s] from all exposures, and its variance, both [H, W]."""
-    weight = np.array([stack.frames * stack.exposure for stack in darks])
-    weight = weight / weight.sum()
-    rate, variance = np.zeros(darks[0].total.shape), np.zeros(darks[0].total.shape)
-    for stack, share in zip(darks, weight, strict=True):
-        arrivals, of_arrivals, _ = response.of_stack(stack)
-        rate += share * arrivals / stack.exposure
-        variance += of_arrivals * (share / stack.exposure) ** 2
-    return rate, variance
+def dark_rates(darks: Sequence[FrameStatistics], response: Response) -> DarkRates:
+    """Return the dark rate of every pixel [1/s] from all exposures in which it is not nearly saturated."""
+    shape = darks[0].total.shape
+    weight, rate, variance = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    missing, frames, exposure = np.full(shape, -1.0), np.zeros(shape), np.zeros(shape)
+    for stack in sorted(darks, key=lambda one: one.exposure):
+        here = response.at(stack.exposure)
+        arrivals = response.of_stack(stack)
+        room = most_counts(here) * stack.frames - stack.total
+        used = (room >= LINEAR) | (weight == 0)
+        time = stack.frames * stack.exposure
+        rate += np.where(used, time * arrivals.value / stack.exposure, 0)
+        variance += np.where(used, arrivals.variance * (time / stack.exposure) ** 2, 0)
+        weight += np.where(used, time, 0)
+        better = room > missing
+        missing = np.where(better, room, missing)
+        frames = np.where(better, stack.frames, frames)
+        exposure = np.where(better, stack.exposure, exposure)
+    rate, variance = rate / weight, variance / weight**2
+    total = sum(stack.frames * stack.exposure for stack in darks)
+    return DarkRates(rate, variance, rate * total, total, missing <= 0, missing, frames, exposure)
 
 
-def spad_flats(
-    flats: Sequence[FrameStatistics], darks: Sequence[FrameStatistics], response: Response
-) -> tuple[list[Flat], Array | None]:
-    """Return the flats of a SPAD array, and the hot pixels [H, W] by the dark frames; None without dark frames."""
-    shape = flats[0].total.shape
-    rate, of_rate = dark_rates(darks, response) if darks else (np.zeros(shape), np.zeros(shape))
-    hot = hot_by_rate(rate * sum(s.frames * s.exposure for s in darks)) if darks else None
-    good = np.ones(shape, bool) if hot is None or hot.all() else ~hot
+def most_counts(response: Response) -> float:
+    """Return the top code, or the most counts that a dead time allows."""
+    top = float(response.levels - 1)
+    return top if response.ratio == 0 else min(top, 1 / response.ratio + 1)
+
+
+def light_of(flat: FrameStatistics, darks: DarkRates | None, response: Response) -> tuple[Array, Array]:
+    """Return the light [H, W] in avalanches per exposure, and its variance without that of the dark level."""
+    arrivals = response.of_stack(flat)
+    if darks is None:
+        return arrivals.value, arrivals.variance
+    return arrivals.value - darks.rate * flat.exposure, arrivals.variance
+
+
+def too_bright(flat: FrameStatistics, good: Array, response: Response) -> bool:
+    """Return whether so many good pixels are saturated in all frames that the mean of the light is biased."""
+    t = flat.frames
+    if response.bits > 1:
+        full = flat.total[good] >= t * (flat.histogram.size - 1)
+        return float(full.mean()) > 1e-3
+    q = (flat.total[good] + 0.0) / (t + 0.5)
+    bias = float(np.mean(q ** (t + 1) / ((t + 1) * (1 - q))))
+    error = np.sqrt(float(np.mean(q / (1 - q))) / (t * q.size))
+    return bool(bias > _CORRECTABLE * error)
+
+
+def spad_flats(flats: Sequence[FrameStatistics], darks: DarkRates | None, hot: Array, response: Response) -> list[Flat]:
+    """Return the flats of a SPAD array without dark levels; `hot` [H, W] are the pixels that are left out."""
+    good = np.ones_like(hot) if hot.all() else ~hot
     found = []
     for flat in flats:
         if flat.frames < 2:
             continue
+        here = response.at(flat.exposure)
         mean = flat.total / flat.frames
-        dark = rate * flat.exposure
+        dark, of_rate = (np.zeros(mean.shape), 0.0) if darks is None else (darks.rate * flat.exposure, darks.variance)
         average = float(dark[good].mean())
-        arrivals, _, _ = response.of_stack(flat)
-        light, codes = _table(mean, good, partial(_above, response.mean, average), float(arrivals[good].max()))
+        arrivals = response.of_stack(flat).value
+        largest = max(float(arrivals[good].max()), 1e-9)
+        light, codes = _table(mean, good, partial(_above, here.mean, average), largest)
         if response.bits == 1:  # exact: 1 - code is a product of light and dark
             slope = 1 - mean
-            level = 1 - slope * np.exp(np.minimum(dark - average, 30.0))
+            level = 1 - slope * np.exp(np.clip(dark - average, -30.0, 30.0))
         else:
             slope = np.interp(arrivals - average, light, np.gradient(codes, light))
             level = mean - slope * (dark - average)
-        noise = flat.pixel_variance / flat.frames + (slope * flat.exposure) ** 2 * of_rate
-        found.append(Flat(level, noise, light, codes, mean))
-    return found, hot
+        in_time = flat.pixel_variance / flat.frames * _excess(here, mean, flat.frames)
+        found.append(Flat(level, in_time + (slope * flat.exposure) ** 2 * of_rate, light, codes, mean))
+    return found
+
+
+def _excess(response: Response, mean: Array, frames: int) -> Array:
+    """Return the variance of a mean over frames, over that which the variance in time of independent frames gives."""
+    excess = response.excess(mean)
+    return np.asarray(excess / np.maximum(1 - (excess - 1) / max(frames - 1, 1), 0.1))
 
 
 def qis_flats(

@@ -69,8 +69,8 @@ class Pattern:
             found["prnu_with_hot_pixels"] = self.with_hot
         unit = f"of {self.left_out.size} pixels"
         return found | {
-            "prnu_left_out": Value(count, count, count, unit, f"hot {self.rule}"),
-            "shading": Value(self.shading, self.shading, self.shading, "rms, relative", "smooth surface, not in PRNU"),
+            "prnu_left_out": Value.exact(count, unit, f"hot {self.rule}"),
+            "shading": Value.exact(self.shading, "rms, relative", "smooth surface, not in PRNU"),
         }
 
 
@@ -79,9 +79,8 @@ def robust_sigma(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
-def hot_by_rate(counts: Array) -> Array:
-    """Return the hot pixels by their expected counts over all dark frames [H, W]: significantly above 10 medians."""
-    median = float(np.median(counts))
+def hot_by_rate(counts: Array, median: float) -> Array:
+    """Return the hot pixels by their counts over all dark frames [H, W]: significantly above 10 times the median."""
     return np.asarray(counts > np.maximum(HOT * median, median + CERTAIN * sqrt(median + 1)))
 
 
@@ -132,24 +131,23 @@ def relative_noise(flat: Flat, good: Array) -> float:
     return float(flat.noise[good].mean()) / lever**2 if lever > 0 else inf
 
 
-def measure_pattern(flats: Sequence[Flat], hot: Array | None) -> Pattern | None:
+def measure_pattern(flats: Sequence[Flat], hot: Array, rule: str = BY_DARK) -> Pattern | None:
     """Measure PRNU in the flat with the least relative noise; None if no flat has light above its dark level.
 
-    All flats share one pattern. `hot` [H, W] are the hot pixels by the dark frames; if None, outliers of the flat.
+    All flats share one pattern. `hot` [H, W] are the pixels that are left out, and `rule` by what they were found.
     """
-    best: tuple[float, Flat, Array] | None = None
+    best: tuple[float, Flat] | None = None
     for flat in flats:
-        out = outliers(flat) if hot is None else hot
-        if (~out).sum() < 3:
+        if (~hot).sum() < 3:
             continue
-        score = relative_noise(flat, ~out)
+        score = relative_noise(flat, ~hot)
         if isfinite(score) and (best is None or score < best[0]):
-            best = (score, flat, out)
+            best = (score, flat)
     if best is None:
         return None
-    _, flat, out = best
-    prnu, shading = _of_good(flat, ~out)
-    return Pattern(prnu, _of_all(flat, ~out), out, BY_FLAT if hot is None else BY_DARK, shading)
+    _, flat = best
+    prnu, shading = _of_good(flat, ~hot)
+    return Pattern(prnu, _of_all(flat, ~hot), hot, rule, shading)
 
 
 def _of_all(flat: Flat, good: Array) -> Value:

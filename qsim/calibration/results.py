@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import exp, inf, sqrt
+from math import exp, inf, isnan, nan, sqrt
 from statistics import NormalDist
 
 from numpy import ndarray as Array
@@ -14,7 +14,7 @@ Z95 = NormalDist().inv_cdf(0.975)  # two-sided 95 % of the normal distribution
 
 @dataclass(frozen=True)
 class Value:
-    """An estimate and its 95 % interval."""
+    """An estimate and its 95 % interval, whose ends are NaN for what has none, and infinite on an open side."""
 
     value: float
     low: float
@@ -22,7 +22,14 @@ class Value:
     unit: str
     method: str
 
+    @classmethod
+    def exact(cls, value: float, unit: str, method: str) -> Value:
+        """Return a number without an interval: a count of what was found, or a description of the recording."""
+        return cls(value, nan, nan, unit, method)
+
     def __str__(self) -> str:
+        if isnan(self.low):
+            return f"{self.value:.5g} {self.unit}"
         return f"{self.value:.5g} [{self.low:.5g}, {self.high:.5g}] {self.unit}"
 
 

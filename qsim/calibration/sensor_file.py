@@ -2,8 +2,9 @@
 
 SENSOR.toml         a device for `--sensor SENSOR.toml`, each number with its source
 SENSOR.json         every value with its interval, the warnings and the goodness of the fit
-SENSOR.png          residuals of the histograms, in sigmas
+SENSOR.png          residuals of the histograms, in sigmas, and the distribution of dark rates over pixels (SPAD)
 SENSOR_dark.npy     DCR map [1/s], float32 [H, W] (SPAD)
+SENSOR_hot.npy      bool [H, W], true at hot pixels (SPAD); the map of `quiver restore --defects`
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 
 _BLOCK_BYTES = 1 << 25
+_DARK_MAP = "_dark.npy"  # ends of file names
+_HOT_MAP = "_hot.npy"
 _MOST_PLANES = 255  # of photon times: all are held at once
 
 
@@ -171,13 +174,16 @@ _UNMEASURED = {
 }
 
 
-def to_toml(found: Calibration, title: str, dark_map: str | None = None) -> str:
+def to_toml(found: Calibration, title: str, stem: str = "") -> str:
     """Return the sensor as a device file, each number with its interval and method as its source.
 
-    The map of dark counts is in a comment, because it fits only frames that are not larger.
+    The maps of file names that begin with `stem` are in comments, because they fit only frames that are not larger. The
+    file of a binary SPAD states no bits: sums of planes have any.
     """
     lines = [f"# {title}", "[sensor]"]
     described = sensor_of(found).to_dict()
+    if found.model == "BinarySPAD":
+        described.pop("bits")
     lines += [f"{key} = {_toml(value)}" for key, value in described.items() if value is not None]
     lines += ["", "[sources]"]
     for key in described:
@@ -186,8 +192,11 @@ def to_toml(found: Calibration, title: str, dark_map: str | None = None) -> str:
             lines.append(f'{key} = "{v.value:.6g}, 95 % interval {v.low:.6g} to {v.high:.6g} {v.unit}; {v.method}"')
         elif key in _UNMEASURED:
             lines.append(f'{key} = "{_UNMEASURED[key]}"')
-    if dark_map is not None:
-        lines += ["", "# [defects]  # uncomment to give every pixel its own dark counts", f'# dark_map = "{dark_map}"']
+    if "dark_count_rate" in found.maps:
+        lines += ["", "# [defects]  # uncomment to give every pixel its own dark counts"]
+        lines += [f'# dark_map = "{stem}{_DARK_MAP}"']
+        hot = int(found.maps["hot_pixels"].sum())
+        lines += [f"# hot pixels: {hot}, true in {stem}{_HOT_MAP}, as in quiver restore --defects {stem}{_HOT_MAP}"]
     return "\n".join(lines) + "\n"
 
 
@@ -198,20 +207,46 @@ def _toml(value: object) -> str:
 
 
 def as_dict(found: Calibration) -> dict[str, Any]:
-    """Return values, warnings and goodness for JSON; NaN becomes null."""
+    """Return values, warnings, goodness and hot pixels for JSON; ends that are open or missing become null."""
     return {
         "model": found.model,
         "bits": found.bits,
-        "values": {name: asdict(value) for name, value in found.values.items()},
-        "p_value": None if math.isnan(found.p_value) else found.p_value,
+        "values": {name: {key: _json(v) for key, v in asdict(value).items()} for name, value in found.values.items()},
+        "p_value": _json(found.p_value),
         "warnings": list(found.warnings),
-    }
+    } | _hot_pixels(found)
+
+
+def _json(value: object) -> object:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _hot_pixels(found: Calibration) -> dict[str, Any]:
+    """Return the places and dark rates [1/s] of the hot pixels, row by row; nothing without a map of them."""
+    if "hot_pixels" not in found.maps:
+        return {}
+    rates = found.maps["dark_count_rate"]
+    places = np.argwhere(found.maps["hot_pixels"])
+    return {"hot_pixels": [{"y": int(y), "x": int(x), "dark_count_rate": float(rates[y, x])} for y, x in places]}
 
 
 def figure(found: Calibration) -> bytes:
-    """Return the residuals of every stack's histogram in sigmas as PNG; those of a good fit lie between -2 and 2."""
-    drawing = new_figure(7, 3.2)
-    axes = drawing.subplots()
+    """Return a PNG: residuals of every stack's histogram in sigmas, and the distribution of dark rates over pixels.
+
+    Residuals of a good fit lie between -2 and 2.
+    """
+    rates = found.maps.get("dark_count_rate")
+    both = rates is not None and bool(found.residuals)
+    drawing = new_figure(12 if both else 7, 3.2)
+    panels = drawing.subplots(1, 2 if both else 1, squeeze=False)
+    if rates is None or both:
+        _draw_residuals(panels[0, 0], found)
+    if rates is not None:
+        _draw_rates(panels[0, -1], rates, found)
+    return figure_png(drawing)
+
+
+def _draw_residuals(axes: Any, found: Calibration) -> None:
     for i, residual in enumerate(found.residuals):
         axes.plot(np.flatnonzero(residual), residual[residual != 0], ".", markersize=3, label=f"stack {i}")
     axes.axhspan(-2, 2, color="tab:green", alpha=0.12)
@@ -221,22 +256,49 @@ def figure(found: Calibration) -> bytes:
     axes.set_title(f"{found.model}: histograms against the fitted model, {p}", fontsize=10)
     if found.residuals:
         axes.legend(fontsize=7, ncols=3)
-    return figure_png(drawing)
 
 
-def beside(path: Path) -> tuple[Path, Path, Path]:
-    """Return the files beside a sensor file: its values, the plot of residuals, and the map of dark counts."""
-    return path.with_suffix(".json"), path.with_suffix(".png"), path.with_name(f"{path.stem}_dark.npy")
+def _draw_rates(axes: Any, rates: Array, found: Calibration) -> None:
+    """Draw the share of pixels above each measured dark rate, hot pixels in red, and the fitted median."""
+    hot = found.maps["hot_pixels"].ravel()
+    order = np.argsort(rates.ravel())
+    shown = rates.ravel()[order]
+    share = 1 - np.arange(order.size) / order.size
+    positive = shown > 0
+    for chosen, colour, label in ((~hot[order], "tab:blue", "pixels"), (hot[order], "tab:red", f"{hot.sum()} hot")):
+        axes.plot(shown[chosen & positive], share[chosen & positive], ".", color=colour, markersize=3, label=label)
+    median = found.values.get("dark_count_rate_median")
+    if median is not None:
+        axes.axvspan(median.low, median.high, color="tab:green", alpha=0.3, label="median")
+    if positive.any():
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+    axes.set_xlabel("dark rate of a pixel [1/s], with counting noise")
+    axes.set_ylabel("share of pixels above")
+    axes.set_title(f"{found.model}: dark rates; {(rates <= 0).mean():.1%} of the pixels have none", fontsize=10)
+    axes.legend(fontsize=7)
+
+
+def beside(path: Path) -> dict[str, Path]:
+    """Return the files beside a sensor file: its values, the plot, and the maps of dark counts and hot pixels."""
+    return {
+        "values": path.with_suffix(".json"),
+        "plot": path.with_suffix(".png"),
+        "dark_count_rate": path.with_name(f"{path.stem}{_DARK_MAP}"),
+        "hot_pixels": path.with_name(f"{path.stem}{_HOT_MAP}"),
+    }
 
 
 def write(found: Calibration, path: Path, title: str) -> list[Path]:
     """Write all files of a calibration, the sensor file last; return their paths."""
-    values, plot, dark_map = beside(path)
-    files.write_json(values, as_dict(found))
-    files.write_bytes(plot, figure(found))
-    rates = found.maps.get("dark_count_rate")
-    if rates is not None:
-        with files.replacing(dark_map) as file:
-            np.save(file, rates.astype(np.float32))
-    files.write_bytes(path, to_toml(found, title, None if rates is None else dark_map.name).encode())
-    return [values, plot, *([] if rates is None else [dark_map]), path]
+    names = beside(path)
+    written = [names["values"], names["plot"]]
+    files.write_json(names["values"], as_dict(found))
+    files.write_bytes(names["plot"], figure(found))
+    for name, kind in (("dark_count_rate", np.float32), ("hot_pixels", np.bool_)):
+        if name in found.maps:
+            with files.replacing(names[name]) as file:
+                np.save(file, found.maps[name].astype(kind))
+            written.append(names[name])
+    files.write_bytes(path, to_toml(found, title, path.stem).encode())
+    return [*written, path]

@@ -88,10 +88,13 @@ def _check_outputs(args: argparse.Namespace, model: str) -> None:
     """Raise an `OSError` if a file to write exists without --force, or is an input."""
     from qsim.calibration.sensor_file import beside, stream_of
 
-    values, plot, dark_map = beside(args.output)
+    written = beside(args.output)
+    if not (model == "spad" and args.dark):
+        written.pop("dark_count_rate")
+        written.pop("hot_pixels")
     inputs = [Path(words[0]) for words in [*args.dark, *args.flat, *([args.static] if args.static else [])]]
     inputs += [path.with_suffix(end) for path in inputs if stream_of(path) is not None for end in (".npy", ".json")]
-    for path in (args.output, values, plot, *([dark_map] if model == "spad" and args.dark else [])):
+    for path in (args.output, *written.values()):
         places = (path, *path.resolve().parents) if path.exists() else ()
         for given in inputs:
             if given.exists() and any(place.samefile(given) for place in places):

@@ -8,6 +8,7 @@ from stats import assert_share
 
 from qsim.calibration.dead_time import calibrate_static, matched_variance
 from qsim.calibration.results import Calibration
+from qsim.calibration.spad_response import Response
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
 
@@ -19,13 +20,13 @@ def test_matched_variance_inverts_the_exact_mean(paralyzable):
     sensor = CountingSPAD(1.0, 0.0, 0.05, 6, paralyzable)
     arrivals = 4.2
     mean = float(sensor.mean(np.array(arrivals), 1.0))
-    found, variance, slope, bend = matched_variance(mean, 6, 0.05, paralyzable)
-    assert found == pytest.approx(arrivals, rel=1e-7)
-    assert variance == pytest.approx(float(sensor.variance(np.array(arrivals), 1.0)), rel=1e-6)
+    response = Response(6, 0.05, paralyzable, 1.0)
     h = 1e-3
-    steps = [matched_variance(mean + sign * h, 6, 0.05, paralyzable) for sign in (1, -1)]
-    assert slope == pytest.approx((steps[0][1] - steps[1][1]) / (2 * h), rel=1e-3)
-    assert bend == pytest.approx((steps[0][2] - steps[1][2]) / (2 * h), rel=1e-3)
+    found = matched_variance(np.array([mean, mean + h, mean - h]), response)
+    assert found.arrivals[0] == pytest.approx(arrivals, rel=1e-7)
+    assert found.variance[0] == pytest.approx(float(sensor.variance(np.array(arrivals), 1.0)), rel=1e-6)
+    assert found.slope[0] == pytest.approx((found.variance[1] - found.variance[2]) / (2 * h), rel=1e-3)
+    assert found.bend[0] == pytest.approx((found.slope[1] - found.slope[2]) / (2 * h), rel=1e-3)
 
 
 def test_real_photons_fano_one_at_low_flux_and_a_dead_time_near_four_nanoseconds():

@@ -41,7 +41,7 @@ def test_without_darks_the_flat_tells_hot_pixels():
     found = calibrate_spad([], [measure([flat], bits=7, exposure=1e-3, photons=None)], bits=7, dead_time=False)
     assert found.values["prnu_left_out"].value == 2
     assert found.values["prnu"].low <= 0.03 <= found.values["prnu"].high
-    assert any("left out of PRNU as hot by the flat: 6 robust sigmas" in words for words in found.warnings)
+    assert any("left out as hot by the flat: 6 robust sigmas" in words for words in found.warnings)
 
 
 @pytest.mark.parametrize("correlation", [-1.0, 0.0, 1.0])

@@ -20,9 +20,10 @@ def test_files_of_a_calibration_load_as_a_device(tmp_path):
     found, _ = SPADCase().calibrate(np.random.default_rng(4))
     path = tmp_path / "mine.toml"
     written = write(found, path, "a test")
-    assert {p.suffix for p in written} == {".toml", ".json", ".png", ".npy"}
+    assert {p.name for p in written} == {"mine.toml", "mine.json", "mine.png", "mine_dark.npy", "mine_hot.npy"}
     loaded = devices.load(path)
     assert loaded == sensor_of(found)
+    assert "bits" not in path.read_text()
     assert np.load(tmp_path / "mine_dark.npy").shape == (24, 24)
     assert defect_table.from_toml(path) is None
     path.write_text(path.read_text().replace("# [defects]", "[defects]").replace("# dark_map", "dark_map"))
