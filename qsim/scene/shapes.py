@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qsim.scene.animated.gltf_buffers import check_for_others
 from qsim.scene.scene import Mesh
 
 Array = NDArray[np.float64]
@@ -219,6 +220,8 @@ def mesh_file(path: str | Path, size: float | None = None) -> Mesh:
 
     if not Path(path).is_file():
         raise FileNotFoundError(f"mesh {path}: no such file")
+    if Path(path).suffix.lower() in (".glb", ".gltf"):
+        check_for_others(Path(path))
     try:
         loaded: Any = trimesh.load(path, force="mesh")
     except Exception as error:  # trimesh raises many types for a broken file
@@ -230,6 +233,8 @@ def mesh_file(path: str | Path, size: float | None = None) -> Mesh:
     longest = float((high - low).max())
     if longest == 0:
         raise ValueError(f"mesh {path}: all its vertices lie in one point")
+    if not loaded.area > 0:
+        raise ValueError(f"mesh {path}: all its triangles have no area; the file is damaged or of a kind not read here")
     scale = 1.0 if size is None else size / longest
     return box_mapped((vertices - (low + high) / 2) * scale, loaded.faces, size or longest)
 

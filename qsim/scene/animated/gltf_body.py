@@ -36,6 +36,7 @@ from qsim.structure import COUNT, Table, expected, is_count, is_number, list_of,
 GLTF_SUFFIXES = (".glb", ".gltf")
 ROUNDING = 0.01  # by which the weights of a file may differ from a sum of 1: four bytes round by less
 TRIANGLES = 4
+MOST_VERTICES = 5_000_000  # of all pieces of a file
 
 ATTRIBUTES = expected("a table of accessors", mapping_of(r"\w+", is_count))
 PRIMITIVE: Table = {
@@ -94,7 +95,12 @@ def animated_file(
     tracks = tracks_of(document, chosen_animation(document, animation), nodes, targets)
     joints, number = joints_of(document, nodes, tracks, order, parents)
     shown = [i for i in _shown(document, nodes, order, parents) if "mesh" in nodes[i]]
-    pieces = [piece for i in shown for piece in _pieces(document, i, nodes, tracks, joints, number)]
+    pieces: list[_Piece] = []
+    for i in shown:
+        for piece in _pieces(document, i, nodes, tracks, joints, number):
+            pieces.append(piece)
+            if sum(len(each.vertices) for each in pieces) > MOST_VERTICES:  # a small file can name one array often
+                raise ValueError(f"{document.path}: its meshes have more than {MOST_VERTICES} vertices in all")
     if not pieces:
         raise ValueError(f"{document.path}: its scene has no mesh")
     clock = Clock(speed, start, max(float(track.times[-1]) for track in tracks.values()), repeat)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import stat
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from qsim.structure import COUNT, FLAG, TEXT, WHOLE, Table, expected, structure
 
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+LARGEST = 1 << 31  # bytes of a file that is read
 NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # What a file may require: these change materials or the type of numbers, which are read in any type.
 KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_punctual", "KHR_mesh_quantization")
@@ -132,25 +134,59 @@ class Document:
 
 def open_document(path: Path) -> Document:
     """Return a .glb or .gltf file of version 2; `FileNotFoundError`, or `ValueError` with the name of the file."""
-    if not path.is_file():
-        raise FileNotFoundError(f"mesh {path}: no such file")
-    raw = path.read_bytes()
-    text, chunk = _chunks(path, raw) if raw[:4] == b"glTF" else (raw, None)
-    try:
-        content = parse_json(path, text.decode("utf-8-sig"))
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: neither a .glb nor a .gltf file: {error.reason} at byte {error.start}") from None
+    content, chunk = _read(path)
     version = structure(content, {"asset": {"version": TEXT}}, str(path), closed=False)["asset"]["version"]
     if not version.startswith("2."):
         raise ValueError(f"{path}: glTF of version {version[:20]}; version 2.0 is read")
+    refuse_required(path, content)
+    buffers = entries_of(path, content, "buffers")
+    return Document(path, content, tuple(_buffer(path, i, each, chunk) for i, each in enumerate(buffers)))
+
+
+def check_for_others(path: Path) -> None:
+    """Raise `ValueError` for a file that another reader (trimesh) would misread, or that leads it out of its folder."""
+    content, _ = _read(path)
+    refuse_required(path, content)
+    for kind in ("buffers", "images"):
+        for i, entry in enumerate(entries_of(path, content, kind)):
+            uri = entry.get("uri") if isinstance(entry, Mapping) else None
+            if isinstance(uri, str) and not uri.startswith("data:"):
+                _file_beside(path, f"{path}: {kind}[{i}]", uri)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], bytes | None]:
+    """Return the JSON of a .glb or .gltf file, and the binary chunk of a .glb file that has one."""
+    if not path.is_file():
+        raise FileNotFoundError(f"mesh {path}: no such file")
+    raw = regular_bytes(path, f"mesh {path}")
+    text, chunk = _chunks(path, raw) if raw[:4] == b"glTF" else (raw, None)
+    try:
+        return parse_json(path, text.decode("utf-8-sig")), chunk
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: neither a .glb nor a .gltf file: {error.reason} at byte {error.start}") from None
+
+
+def refuse_required(path: Path, content: Mapping[str, Any]) -> None:
+    """Raise `ValueError` for a file that cannot be understood without an extension that is not read."""
     needed = content.get("extensionsRequired", [])
     if not isinstance(needed, list) or not all(isinstance(name, str) for name in needed):
         raise ValueError(f"{path}: extensionsRequired: expected a list of names")
     unknown = [name for name in needed if not name.startswith(KNOWN_EXTENSIONS)]
     if unknown:
-        raise ValueError(f"{path}: needs the extension {unknown[0]:.60}, which is not read; export without it")
-    buffers = entries_of(path, content, "buffers")
-    return Document(path, content, tuple(_buffer(path, i, each, chunk) for i, each in enumerate(buffers)))
+        raise ValueError(
+            f"{path}: needs the extension {', '.join(f'{name:.60}' for name in unknown)}, which is not read; export "
+            "without it (without compression)"
+        )
+
+
+def regular_bytes(path: Path, where: str) -> bytes:
+    """Return the bytes of a regular file of at most LARGEST bytes; a pipe or device is refused before it is read."""
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError(f"{where}: {path} is no regular file")
+    if status.st_size > LARGEST:
+        raise ValueError(f"{where}: {path} has {status.st_size} bytes; at most {LARGEST} are read")
+    return path.read_bytes()
 
 
 def entries_of(path: Path, content: Mapping[str, Any], kind: str) -> list[Any]:
@@ -204,11 +240,15 @@ def _buffer(path: Path, index: int, entry: Any, chunk: bytes | None) -> bytes:
 
 
 def _file_beside(path: Path, where: str, uri: str) -> bytes:
+    """Return the bytes of a file that a uri names; it lies beside the document or below, and is a regular one."""
     name = unquote(uri)
     if ":" in uri.partition("/")[0] or "\0" in name:
         raise ValueError(f"{where}: uri {uri[:60]!r}; the name of a file beside it is expected")
+    folder = path.parent.resolve()
     target = path.parent / name
+    if not target.resolve().is_relative_to(folder):
+        raise ValueError(f"{where}: uri {uri[:60]!r} leads out of {folder}; a file beside it or below is expected")
     try:
-        return target.read_bytes()
+        return regular_bytes(target, where)
     except OSError as error:
         raise FileNotFoundError(f"{where}: the buffer is missing: {target}: {error.strerror}") from None

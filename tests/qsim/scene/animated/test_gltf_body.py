@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from qsim.scene import Body, Translation, animated_file
 from qsim.scene.animated.gltf_body import animations_in
+from qsim.scene.shapes import mesh_file
 
 KINDS = ("STEP", "LINEAR", "CUBICSPLINE")
 SINGLE = 3e-6  # relative: files hold single precision, chains of five matrices add up
@@ -490,3 +492,37 @@ def test_choices_are_checked(tmp_path):
         animated_file(path, 0.0)
     with pytest.raises(ValueError, match=r"Clock.speed: expected a finite number, got nan"):
         animated_file(path, speed=float("nan"))
+
+
+@pytest.mark.parametrize("reader", [animated_file, mesh_file])
+@pytest.mark.parametrize("leads", ["../away.bin", "/away.bin", "link.bin", "pipe", "/dev/zero", "%2e%2e/away.bin"])
+def test_a_uri_names_a_regular_file_beside_the_document(tmp_path, reader, leads):
+    folder = tmp_path / "here"
+    folder.mkdir()
+    path = arm().write(folder / "arm.gltf", "beside")
+    (tmp_path / "away.bin").write_bytes((folder / "arm.bin").read_bytes())
+    (folder / "link.bin").symlink_to(tmp_path / "away.bin")
+    os.mkfifo(folder / "pipe")
+    content = json.loads(path.read_text())
+    content["buffers"][0]["uri"] = leads.replace("/away", f"{tmp_path}/away") if leads == "/away.bin" else leads
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"buffers\[0\]: .*(leads out of|no regular file)"):
+        reader(path)
+
+
+@pytest.mark.parametrize("reader", [animated_file, mesh_file])
+@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "ACME_anything"])
+def test_a_required_extension_is_refused_by_name(tmp_path, reader, name):
+    document = arm()
+    document.content["extensionsRequired"] = [name]
+    with pytest.raises(ValueError, match=f"needs the extension {name}, which is not read; export without it"):
+        reader(document.write(tmp_path / "arm.glb"))
+
+
+def test_a_small_file_that_names_one_array_often_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("qsim.scene.animated.gltf_body.MOST_VERTICES", 1000)
+    document = arm()
+    for mesh in document.content["meshes"]:
+        mesh["primitives"] = mesh["primitives"] * 500
+    with pytest.raises(ValueError, match="its meshes have more than 1000 vertices in all"):
+        animated_file(document.write(tmp_path / "arm.glb"))
