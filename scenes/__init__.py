@@ -68,11 +68,14 @@ FAMILIES: dict[str, Family] = {
 RECIPES = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.toml"))}  # of data sets, by name
 
 
-def load(name: str | Path, seed: int = 0, speed: float = 1.0, *, along_path: bool = False) -> Scene:
+def load(
+    name: str | Path, seed: int = 0, speed: float = 1.0, *, along_path: bool = False, bands: str | None = None
+) -> Scene:
     """Return the scene of a family, a .py file with `scene(seed, *, speed)`, a folder of assets, glTF or Mitsuba XML.
 
     `asset_folder.py` states what a folder may hold, `gltf_file.py` what becomes of an animated .glb or .gltf. An XML
-    scene stands still and has no seed: a Python file that calls `qsim.read_mitsuba` moves its shapes.
+    scene stands still and has no seed: a Python file that calls `qsim.read_mitsuba` moves its shapes. With
+    `bands="rgb"` an XML scene is read in colour; others are coloured afterwards (colours.py).
     `FileNotFoundError` for a missing file; `ValueError` for a name that is none of these, for a speed outside 0.001
     to 1000, and for one other than 1 that changes no motion of a .py or .xml scene, unless its camera will move
     `along_path`, on which the speed acts.
@@ -98,7 +101,7 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0, *, along_path: boo
             raise ValueError(f"{name}: an XML scene has no motion, so speed {speed:g} changes nothing; leave it out")
         from qsim.rendering.mitsuba_xml import read_mitsuba
 
-        return read_mitsuba(name)
+        return read_mitsuba(name, bands=bands)
     if str(name).endswith(GLTF_SUFFIXES):
         return gltf_file.scene(seed, speed=speed, file=name)
     if (Path(name) / "clip.json").is_file():

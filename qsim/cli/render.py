@@ -42,8 +42,8 @@ def add_render(sub: Any) -> None:
     )
     parser.add_argument("--speed", type=checked(checks.speed), default=1.0, help="factor on all motions (default 1)")
     parser.add_argument("--frames", type=whole, default=21, help="number of frames (default 21)")
-    parser.add_argument("--height", type=whole, default=128, help="pixels (default 128)")
-    parser.add_argument("--width", type=whole, default=128, help="pixels (default 128)")
+    parser.add_argument("--height", type=whole, help="pixels (default 128; of a Mitsuba file its film's)")
+    parser.add_argument("--width", type=whole, help="pixels (default 128; of a Mitsuba file its film's)")
     rate, shutter, psnr = (checked(check) for check in (checks.frame_rate, checks.shutter, checks.psnr))
     parser.add_argument("--frame-rate", type=rate, default=2000.0, help="frames per second (default 2000)")
     parser.add_argument(
@@ -109,7 +109,7 @@ def _run_render(args: argparse.Namespace) -> int:
         clip = render(args.scene, args.output, **taken, **size, progress=progress, force=args.force)
     render_meta = clip.meta["render"]
     found = stated(clip.meta)
-    text = f"{clip.path}: {len(clip)} frames of {args.height} x {args.width}"
+    text = f"{clip.path}: {len(clip)} frames of {clip.shape[1]} x {clip.shape[2]}"
     text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
     text += f", {clip.mean_photons:.4g} photons per pixel"
     if args.scene.endswith(GLTF_SUFFIXES):

@@ -78,7 +78,7 @@ def load_traced(job: Job) -> tuple[Scene, dict[str, str]]:
 
     settings = job.settings
     moved, size = settings.camera_path is not None, (settings.height, settings.width)
-    scene, read = scene_files.load(job.family, job.scene_seed, job.speed, along_path=moved)
+    scene, read = scene_files.load(job.family, job.scene_seed, job.speed, along_path=moved, bands=settings.bands)
     scene = along_path(scene, settings.camera_path, settings.frame_rate, size, job.speed)
     return in_bands(scene.resized(*size), settings.bands), read
 

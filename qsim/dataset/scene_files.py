@@ -38,18 +38,19 @@ _LEFT_OUT = tuple(
 )
 _DEVICES, _SHARED = "/dev/", "/dev/shm/"  # the second holds files of users
 _LIBRARY = Path(scenes.__file__).resolve().parent
+MOST_FOLDERS, MOST_FILES = 100, 10_000  # of one Mitsuba scene
 _PARTS_LEFT_OUT = frozenset({".cache", "site-packages", "dist-packages"})
 
 
 def load(
-    family: str | Path, seed: int = 0, speed: float = 1.0, *, along_path: bool = False
+    family: str | Path, seed: int = 0, speed: float = 1.0, *, along_path: bool = False, bands: str | None = None
 ) -> tuple[Scene, dict[str, str]]:
     """Load a scene as `scenes.load` does, with the SHA-256 of each file read; empty for a family of the library."""
     path = Path(family).resolve()
     if str(family) in scenes.FAMILIES or not path.exists():
-        return scenes.load(family, seed, speed, along_path=along_path), {}
+        return scenes.load(family, seed, speed, along_path=along_path, bands=bands), {}
     with _tracing() as trace:
-        scene = scenes.load(family, seed, speed, along_path=along_path)
+        scene = scenes.load(family, seed, speed, along_path=along_path, bands=bands)
     if path.suffix == ".xml":
         found = of_xml(path)
     elif path.is_dir():
@@ -83,7 +84,7 @@ def of_xml(path: Path) -> set[Path]:
     Mitsuba looks beside the scene, in the folders of <path> and in the working folder; all existing files count.
     """
     found: set[Path] = set()
-    _follow(path, [path.parent, Path.cwd()], {}, found)
+    _follow(path, [_plain(path.parent), Path.cwd()], {}, found)
     return found
 
 
@@ -92,16 +93,22 @@ def _follow(path: Path, folders: list[Path], defaults: dict[str, str], found: se
     if path in found:
         return
     found.add(path)
+    if len(found) > MOST_FILES:
+        raise ValueError(f"{path}: a scene that names more than {MOST_FILES} files")
     try:
         elements = list(ElementTree.parse(path).iter())
     except (ElementTree.ParseError, OSError, ValueError):
         return  # Mitsuba reports the error
-    folders.append(path.parent)
+    if _plain(path.parent) not in folders:
+        folders.append(_plain(path.parent))
     for element in elements:
         if element.tag == "default":
             defaults.setdefault(element.get("name", ""), element.get("value", ""))
         if element.tag == "path":
-            folders += [folder / element.get("value", "") for folder in list(folders)]
+            added = [folder / element.get("value", "") for folder in folders]
+            folders += [folder for folder in dict.fromkeys(map(_plain, added)) if folder not in folders]
+            if len(folders) > MOST_FOLDERS:
+                raise ValueError(f"{path}: names more than {MOST_FOLDERS} folders by <path>")
     for element in elements:
         for value in element.attrib.values():
             written = re.sub(r"\$(\w+)", lambda match: defaults.get(match[1], match[0]), value)
@@ -112,6 +119,11 @@ def _follow(path: Path, folders: list[Path], defaults: dict[str, str], found: se
                         _follow(file, folders, defaults, found)
                     elif file.is_file():
                         found.add(file)
+
+
+def _plain(folder: Path) -> Path:
+    """Return a folder without `.` and `..`, so that one folder has one name."""
+    return Path(os.path.normpath(folder))
 
 
 @dataclasses.dataclass

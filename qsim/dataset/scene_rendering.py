@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import tempfile
+import warnings
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -111,12 +113,41 @@ def load_scene(
             raise ValueError(f"scene {scene.name}: a Scene has its motions already; leave speed= out")
         size = height or scene.camera.height, width or scene.camera.width
         return in_bands(along_path(scene, camera_path, frame_rate, size).resized(*size), bands), {}
-    factor, size = (
-        1.0 if speed is None else speed,
-        (SIDE if height is None else height, SIDE if width is None else width),
-    )
-    loaded, read = scene_files.load(os.fspath(scene), seed, factor, along_path=camera_path is not None)
-    return in_bands(along_path(loaded, camera_path, frame_rate, size, factor).resized(*size), bands), read
+    factor = 1.0 if speed is None else speed
+    loaded, read = scene_files.load(os.fspath(scene), seed, factor, along_path=camera_path is not None, bands=bands)
+    size = size_of(loaded, height, width)
+    if loaded.file is not None and camera_path is None:
+        _warn_of_another_view(loaded, size)
+    seen = along_path(loaded, camera_path, frame_rate, size, factor).resized(*size)
+    return in_bands(seen, bands), read
+
+
+def _warn_of_another_view(scene: Scene, size: tuple[int, int]) -> None:
+    """Warn where frames of another shape than a Mitsuba file's film see less, or more, to the sides."""
+    film, shown = scene.camera, scene.camera.resized(*size)
+    before, after = (2 * math.degrees(math.atan(camera.width / 2 / camera.focal_pixels)) for camera in (film, shown))
+    if abs(after - before) > 0.01 * before + math.degrees(1 / shown.focal_pixels):
+        warnings.warn(
+            f"{scene.name}: the file's film is {film.height} x {film.width} pixels (height x width); at {size[0]} x "
+            f"{size[1]} the vertical view stays, and the horizontal one is {after:.1f} instead of {before:.1f} degrees",
+            stacklevel=3,
+        )
+
+
+def size_of(scene: Scene, height: int | None, width: int | None) -> tuple[int, int]:
+    """Return (height, width) [px] of the frames: what is asked, else of a Mitsuba file its film's, else SIDE.
+
+    One side alone keeps the shape of a Mitsuba file's film.
+    """
+    if scene.file is None:
+        return SIDE if height is None else height, SIDE if width is None else width
+    film = scene.camera
+    if height is None and width is None:
+        return film.height, film.width
+    if height is None:
+        assert width is not None
+        return max(1, round(width * film.height / film.width)), width
+    return height, max(1, round(height * film.width / film.height)) if width is None else width
 
 
 def along_path(
@@ -138,7 +169,9 @@ def along_path(
 
 def in_bands(scene: Scene, bands: str | None) -> Scene:
     """Return a scene as it is, or for "rgb" in colour. `ValueError` for other bands, and for a scene with bands."""
-    return scene if bands is None else coloured(scene) if checks.bands(bands) else scene
+    if bands is None or (scene.file is not None and scene.bands is not None):  # the file was read in colour
+        return scene
+    return coloured(scene) if checks.bands(bands) else scene
 
 
 class TemporaryFolder:

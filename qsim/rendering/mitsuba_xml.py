@@ -20,7 +20,9 @@ import numpy as np
 from qsim import files
 from qsim.checks import suggest
 from qsim.optics.camera import Camera, Pose, Vector
-from qsim.rendering.engine import errors_only, select
+from qsim.optics.lens import Lens
+from qsim.optics.radiometry import RGB
+from qsim.rendering.engine import activate, errors_only, in_colour, select
 from qsim.rendering.mitsuba_mesh import POSITIONS
 from qsim.scene import MitsubaFile, Part, Scene
 from qsim.scene.flicker import Flicker
@@ -38,18 +40,25 @@ def read_mitsuba(
     *,
     camera: Camera | None = None,
     flickers: Mapping[str, Flicker] | None = None,
+    bands: str | None = None,
 ) -> Scene:
     """Return the scene of a Mitsuba XML file; shapes named by their `id` follow `motions`, all others rest.
 
     `flickers` are the strengths over time of emitters by their `id`, of glowing shapes by that of the shape.
-    Without `camera` the file's first sensor is taken, a pinhole of its field of view and size behind an f/2.8 lens on
-    pixels of 1.1 um. The file's integrator and samples do not count. `FileNotFoundError` for a missing file;
-    `ValueError` for a file that Mitsuba refuses, without light, with participating media, with a camera that is not a
-    plain `perspective`, for motions of unknown shapes or of shapes that cannot be moved rigidly, and for flickers of
-    lights that are unknown or whose strength is not one number. Shapes with holes by opacity warn: their truth is that
-    of the whole shape.
+    Without `camera` the file's first sensor is taken: a pinhole of its field of view, its film's size or crop window
+    and its principal point, behind an f/2.8 lens on pixels of 1.1 um. A pixel is the mean over its area, whatever the
+    film's reconstruction filter; integrator, samples and shutter times do not count. With `bands="rgb"` the scene is in
+    colour, which emitters of some kinds need. `FileNotFoundError` for a missing file; `ValueError` for a file that
+    Mitsuba refuses to load or to render, without light, with participating media, with a camera that is not a plain
+    `perspective` or whose clipping planes cut away what it sees, for motions of unknown shapes or of shapes that cannot
+    be moved rigidly, and for flickers of lights that are unknown or whose strength is not one number. Shapes with holes
+    by opacity warn: their truth is that of the whole shape.
     """
-    select()
+    if bands not in (None, "rgb"):
+        raise ValueError(f"bands {bands!r}: expected 'rgb', or None for one band")
+    engine = select()
+    if bands is not None:
+        activate(in_colour(engine))
     import mitsuba as mi
 
     path, motions = Path(xml), motions or {}
@@ -65,6 +74,10 @@ def read_mitsuba(
                 f"{path}: shape {shape.id()!r} has holes by its opacity; truth (flow, depth, bodies) ignores them",
                 stacklevel=2,
             )
+    reason = _rejected(mi, loaded)
+    if reason is not None:
+        del loaded  # what Mitsuba rejects must not outlive this call: it traces every light that exists
+        raise ValueError(f"{path}: Mitsuba cannot render it: {reason}{_cure(mi)}")
     names = [shape.id() for shape in loaded.shapes()]
     parameters = mi.traverse(loaded)
     for name in motions:
@@ -78,7 +91,34 @@ def read_mitsuba(
     parts = tuple(Part(name, motions.get(name)) for name in names)
     camera = camera or _camera(mi, loaded, path)
     file = MitsubaFile(str(path), files.sha256(path), dict(flickers) if flickers else None)
-    return Scene(path.stem, 0, camera, (), (), file=file, parts=parts)
+    return Scene(path.stem, 0, camera, (), (), file=file, parts=parts, bands=None if bands is None else RGB)
+
+
+def _rejected(mi: Any, loaded: Any) -> str | None:
+    """Return why Mitsuba rejects while it renders what it has loaded, as a spectrum of another variant; None if not.
+
+    The paths are only recorded, which asks every material and light of the scene, and not traced.
+    """
+    film = {"type": "hdrfilm", "width": 2, "height": 2}
+    try:
+        with errors_only(mi):  # it warns that a colour film becomes grey
+            sensor = mi.load_dict({"type": "perspective", "film": film})
+            mi.render(loaded, sensor=sensor, integrator=mi.load_dict({"type": "path", "max_depth": 3}), spp=1)
+    except RuntimeError as error:
+        return _reason(error)
+    return None
+
+
+def _reason(error: BaseException) -> str:
+    """Return the text of an error's first cause, in one line."""
+    while (cause := error.__cause__ or error.__context__) is not None:
+        error = cause
+    return " ".join(str(error).split())[:400]
+
+
+def _cure(mi: Any) -> str:
+    """Return what helps against a spectrum that grey rendering lacks; empty in colour."""
+    return "" if mi.variant().endswith("_rgb") else "; if it needs colour, render with --bands rgb (bands='rgb')"
 
 
 def _check_flicker(path: Path, name: str, flicker: Flicker, loaded: Any, parameters: Any) -> None:
@@ -101,7 +141,8 @@ def load(mi: Any, path: str) -> Any:
         with errors_only(mi):  # it warns that a colour film becomes grey; no film is used
             loaded = mi.load_file(path, optimize=False)  # optimising would merge shapes and lose their names
     except RuntimeError as error:
-        raise ValueError(f"{path}: Mitsuba cannot load it: {' '.join(str(error).split())}") from None
+        needs = _cure(mi) if "RGB" in str(error) else ""
+        raise ValueError(f"{path}: Mitsuba cannot load it: {_reason(error)}{needs}") from None
     if not isinstance(loaded, mi.Scene):
         raise ValueError(f"{path}: its root element is not <scene>; only scene files can be read")
     for i, shape in enumerate(loaded.shapes()):
@@ -117,19 +158,26 @@ def _camera(mi: Any, loaded: Any, path: Path) -> Camera:
         raise ValueError(f"{path}: no sensor; {ask}")
     sensor = loaded.sensors()[0]
     values = mi.traverse(sensor)
+
+    def number(name: str) -> float:
+        return float(np.ravel(values[name])[0])
+
     if sensor.class_name() != "PerspectiveCamera":
         raise ValueError(f"{path}: its sensor is a {sensor.class_name()}, only 'perspective' is taken over; {ask}")
-    if any(abs(float(np.ravel(values[f"principal_point_offset_{axis}"])[0])) > 1e-9 for axis in "xy"):
-        raise ValueError(f"{path}: its sensor's principal point is off the middle; {ask}")
     pose = np.array(values["to_world"].matrix, np.float64).reshape(4, 4)
     _, up, forward = pose[:3, :3].T  # Mitsuba's camera axes: left, up, forward
     if np.linalg.det(pose[:3, :3]) <= 0:
         raise ValueError(f"{path}: its sensor's to_world mirrors the picture; {ask}")
-    width, height = (int(n) for n in sensor.film().size())
-    field = math.radians(float(np.ravel(values["x_fov"])[0]))
-    focal_length = PITCH * width / 2 / math.tan(field / 2)
-    return Camera(
-        focal_length=focal_length,
+    film_width, film_height = (int(n) for n in sensor.film().size())
+    width, height = (int(n) for n in sensor.film().crop_size())
+    left, top = (int(n) for n in sensor.film().crop_offset())
+    field = math.radians(number("x_fov"))  # of the complete film
+    # The pixel that the optical axis meets; offsets are shares of the complete film.
+    x = film_width / 2 - left - number("principal_point_offset_x") * film_width
+    y = film_height / 2 - top - number("principal_point_offset_y") * film_height
+    shift = ((x - width / 2) / height, (y - height / 2) / height)
+    camera = Camera(
+        focal_length=PITCH * film_width / 2 / math.tan(field / 2),
         f_number=F_NUMBER,
         pixel_pitch=PITCH,
         height=height,
@@ -137,7 +185,28 @@ def _camera(mi: Any, loaded: Any, path: Path) -> Camera:
         origin=_vector(pose[:3, 3]),
         target=_vector(pose[:3, 3] + forward),
         up=_vector(up),
+        lens=Lens(shift=shift),
     )
+    _check_clipping(mi, loaded, camera, (number("near_clip"), number("far_clip")), path)
+    return camera
+
+
+def _check_clipping(mi: Any, loaded: Any, camera: Camera, planes: tuple[float, float], path: Path) -> None:
+    """Raise `ValueError` if the planes near and far of the file's sensor hide what its pixels' middles see."""
+    pose = camera.pose()
+    slopes = camera.directions().reshape(-1, 3)  # of z = 1, so that a distance along them is a depth
+    origin = mi.Point3f(*map(float, pose[:3, 3]))
+    hidden = 0
+    for slope in [slopes] if mi.variant().startswith(("llvm", "cuda")) else slopes[:, None]:
+        directions = (slope @ pose[:3, :3].T).T
+        ray = mi.Ray3f(origin, mi.Vector3f(*(directions if len(slope) > 1 else map(float, directions[:, 0]))))
+        depth = np.array(loaded.ray_intersect_preliminary(ray).t, np.float64)
+        hidden += int(np.sum(np.isfinite(depth) & ((depth < planes[0]) | (depth > planes[1]))))
+    if hidden:
+        raise ValueError(
+            f"{path}: its sensor's near_clip {planes[0]:g} and far_clip {planes[1]:g} hide what {hidden} of "
+            f"{len(slopes)} pixels see; this program has no clipping planes: remove those shapes, or widen the planes"
+        )
 
 
 def _vector(values: np.ndarray) -> Vector:

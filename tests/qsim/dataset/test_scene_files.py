@@ -5,6 +5,7 @@ import random
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -179,21 +180,6 @@ def test_another_mesh_in_a_folder_that_is_listed_is_refused(place: Path, tmp_pat
         generate(own, tmp_path / "d", HERE, make=make)
 
 
-def test_a_data_set_of_an_earlier_version_goes_by_the_scene_file_alone(place: Path, tmp_path: Path):
-    path = write_scene(place)
-    own = only(wanted(path), "wheel")
-
-    def make_before(job: Job, target: Path) -> object:
-        return write_clip(target, frames=1, height=2, width=3, **provenance.origin(job))
-
-    generate(own, tmp_path / "d", HERE, make=make_before)
-    edit(place / "data.csv", random.Random(0))
-    assert generate(own, tmp_path / "d", HERE, make=make).done == 2
-    edit(path, random.Random(0))
-    with pytest.raises(ValueError, match="made with other settings"):
-        generate(only(wanted(path), "wheel"), tmp_path / "d", HERE, make=make)
-
-
 XML = """<scene version="3.0.0">
   <default name="kind" value="rough"/>
   <path value="assets"/>
@@ -250,3 +236,20 @@ def test_choosing_an_engine_is_no_reading_of_the_scene(tmp_path: Path, name: str
     made = subprocess.run(command, env=os.environ | {"PYTHONPATH": ROOT}, capture_output=True, text=True, check=True)
     expected = sorted({name, "s.xml", "m.obj"})
     assert made.stdout.splitlines() == [str(expected)] * 2
+
+
+def test_folders_named_by_path_cost_no_more_than_their_number(tmp_path: Path):
+    """Each <path> doubled the folders that were searched: twenty of them took a minute."""
+    text = '<scene version="3.0.0">{}<shape type="ply"><string name="filename" value="mesh.ply"/></shape></scene>'
+    (tmp_path / "mesh.ply").write_text("mesh")
+    (tmp_path / "s.xml").write_text(text.format('<path value="."/><path value="./sub/.."/>' * 500))
+    started = time.process_time()
+    assert scene_files.of_xml(tmp_path / "s.xml") == {tmp_path / "s.xml", tmp_path / "mesh.ply"}
+    once = time.process_time() - started
+    (tmp_path / "s.xml").write_text(text.format('<path value="."/>'))
+    started = time.process_time()
+    scene_files.of_xml(tmp_path / "s.xml")
+    assert once < 100 * (time.process_time() - started) + 0.5
+    (tmp_path / "s.xml").write_text(text.format("".join(f'<path value="{i}"/>' for i in range(200))))
+    with pytest.raises(ValueError, match=r"names more than 100 folders by <path>"):
+        scene_files.of_xml(tmp_path / "s.xml")
