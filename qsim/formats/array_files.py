@@ -104,13 +104,15 @@ def read_light_npy(path: Path, hints: Hints) -> Recording:
     return light_of(path, Values(array.shape, array.dtype, lambda index: array[index]), ".npy", hints)
 
 
-def codes_of(path: Path, values: Values, source: str, hints: Hints) -> Recording:
-    """Return an array as codes of one bit (bool) or of the stated bits; its axes by --axes."""
-    reading = axes.named(path, values.shape, hints)
+def codes_of(
+    path: Path, values: Values, source: str, hints: Hints, *, stated: str | None = None, bits: int | None = None
+) -> Recording:
+    """Return an array as codes of one bit (bool) or of the stated bits; its axes by --axes, else as `stated`."""
+    reading = axes.named(path, values.shape, hints, stated)
     if reading.colour:
         raise ValueError(f"{path}: colours hold no codes; name the axis of channels C, and choose one with --channel")
     shape = check_shape(path, reading.shape(values.shape))
-    bits = 1 if values.dtype == bool else hints.bits
+    bits = 1 if values.dtype == bool else bits or hints.bits
     if bits is None or values.dtype.kind not in "bui":
         raise ValueError(f"{path}: {values.dtype} codes need a number of bits, as in --bits 3")
 

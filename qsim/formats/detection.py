@@ -9,7 +9,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.files import load_array
-from qsim.formats import array_files, hdf5, images, mat_files, photon_times, raw_cameras, raw_layout, video
+from qsim.formats import array_files, hdf5, images, mat_files, photon_times, raw_cameras, raw_layout, tcspc, video
 from qsim.formats.recording import Hints, Recording
 
 Reader = Callable[[Path, Hints], Recording]
@@ -35,6 +35,8 @@ LAYOUTS: dict[str, Reader] = {  # the names of --layout
     "mono10packed": raw_layout.read_mono10packed,
     "mono12packed": raw_layout.read_mono12packed,
     "mraw": raw_layout.read_mraw,
+    "ptu": tcspc.read_ptu,
+    "sdt": tcspc.read_sdt,
 }
 _WHOLE = "none: whole bytes per pixel"
 # (bit order, orientation) of layouts whose readers do not state it, and the reason for it.
@@ -48,6 +50,8 @@ ASSUMED: dict[str, tuple[str, str]] = {
     "visionsim": ("msb", "upright"),  # np.packbits along rows of pictures as rendered
     "zarr": (_WHOLE, "upright"),  # quanta-spad-sim draws row 0 on top
     "photons": (_WHOLE, "upright"),  # as the stream that it was made from
+    "ptu": (_WHOLE, "as stored"),  # in the order of the scan
+    "sdt": (_WHOLE, "as stored"),
     "hdf5": (_WHOLE, "upright"),  # as arrays are shown
     "mat": (_WHOLE, "as stored"),  # OUTPUT's rows are the array's; the camera's orientation is not in a file
 }
@@ -69,7 +73,7 @@ def detect(path: Path, hints: Hints | None = None) -> str:
         return _detect_folder(path)
     suffix = "".join(path.suffixes[-2:]) if path.suffix == ".gz" else path.suffix.lower()
     simple = {".png": "png", ".tif": "tiff", ".tiff": "tiff", ".mat": "mat", ".dat": "spike", ".npz": "photons"}
-    simple |= {".mraw": "mraw", ".cihx": "mraw", ".cih": "mraw"}
+    simple |= {".mraw": "mraw", ".cihx": "mraw", ".cih": "mraw", ".ptu": "ptu", ".sdt": "sdt"}
     simple |= dict.fromkeys((".h5", ".hdf5", ".hdf", ".he5", ".nxs"), "hdf5")
     if suffix in simple:
         return simple[suffix]

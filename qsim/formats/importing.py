@@ -29,6 +29,7 @@ from qsim.formats import gaps
 from qsim.formats.detection import ASSUMED, LAYOUTS, detect
 from qsim.formats.recording import Hints, Marked, Recording, reoriented, with_stated_layout
 from qsim.sensor import colour_filter, devices, packing
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
@@ -110,6 +111,7 @@ def to_clip(
         name = "sensor" if capture.sensor is not None else "ppp"
         raise ValueError(f"{path}: {recording.source} holds light, which no sensor made; leave --{name} out")
     check_outside(path)
+    recording = _within_halves(recording)
     frames, height, width = recording.shape
     meta: dict[str, Any] = {
         "shape": [frames, height, width],
@@ -132,6 +134,30 @@ def to_clip(
     return Clip.open(path)
 
 
+def _within_halves(recording: Recording) -> Recording:
+    """Return light in a unit in which half floats hold it: floats beyond their range are scaled by a power of 2.
+
+    `scale` in the meta is the light of the clip over that of the file.
+    """
+    if recording.full_scale:
+        return recording
+    largest = max(float(light.max(initial=0)) for _, light in blocks(recording))
+    if largest == 0 or exr.SMALLEST <= largest <= exr.HALF_MAX:
+        return recording
+    most = exr.HALF_MAX if largest > exr.HALF_MAX else 1.0
+    scale = 2.0 ** math.floor(math.log2(most / largest))
+    marked = recording.marked or _unmarked(recording)
+
+    def scaled(start: int, stop: int) -> tuple[Array, Array]:
+        light, mask = marked(start, stop)
+        return (light.astype(np.float64) * scale).astype(np.float32), mask
+
+    said = f"light of up to {largest:g} is scaled by {scale:g}, because clips hold half floats"
+    reading = "; ".join(filter(None, (recording.reading, said)))
+    meta = recording.meta | {"scale": scale}
+    return replace(recording, read=lambda a, b: scaled(a, b)[0], marked=scaled, meta=meta, reading=reading)
+
+
 def _unmarked(recording: Recording) -> Marked:
     """Return the light of a recording without information on saturation."""
 
@@ -148,15 +174,14 @@ def saturation_line(clip: Clip) -> str:
     missing = len((clip.meta.get("source") or {}).get("missing_frames", ()))
     white, count = known["white"], int(clip.meta.get("saturated_pixels") or 0) - missing * math.prod(clip.shape[1:])
     share = f"{100 * count / math.prod(clip.shape):.3g} % of pixels"
-    cut = f"; light above {exr.HALF_MAX:g}, the most a clip holds, is cut off and counts as saturated: {share}"
+    scale = (clip.meta.get("source") or {}).get("scale")
+    cut = "" if scale is None else f"; the light of the file is scaled by {scale:g}"
     if white is None:
-        return "saturation not known: floats have no largest value; give it with --white" + (cut if count else "")
+        return "saturation not known: floats have no largest value; give it with --white" + cut
     said = f"white {white:g}{' assumed' if known['assumed'] else ''}"
     if count:
-        above = white > exr.HALF_MAX and not known["assumed"]  # of floats; whole numbers become light of at most 1
-        above = above and any(clip.radiance(t).max() >= exr.HALF_MAX for t in range(len(clip)))
-        return f"{said}: {share} saturated" + (cut if above else "")
-    return f"{said}: no pixel reaches it" + (
+        return f"{said}: {share} saturated{cut}"
+    return f"{said}: no pixel reaches it{cut}" + (
         "; if the camera saturates below it, give --white" if known["assumed"] else ""
     )
 
@@ -258,6 +283,8 @@ def _ranges(recording: Recording) -> Iterator[tuple[int, int]]:
 def _sensor(recording: Recording, capture: Import) -> Sensor:
     if capture.sensor is not None:
         return devices.load(capture.sensor, ppp=capture.ppp, bits=recording.bits, exposure=capture.seconds)
+    if recording.code_model == CountingSPAD.code_model:
+        return CountingSPAD(pde=1.0, dark_count_rate=0.0, dead_time=0.0, bits=recording.bits or 1)
     return BinarySPAD(pde=1.0, dark_count_rate=0.0, bits=recording.bits or 1)
 
 

@@ -51,6 +51,7 @@ class Recording:
     exposure: float | None = None  # s, if the file states it
     reading: str = ""  # how the bytes or axes were read, in words; empty: only one way is known
     times: Times | None = None  # of the frames, if the file states them
+    full_scale: bool = True  # light of whole numbers, at most 1; False: of floats, in any unit
 
     @property
     def is_light(self) -> bool:
@@ -108,7 +109,10 @@ def light_recording(
     if hints.black is not None:
         marked = _without_black(path, marked, hints.black, meta["transfer"], full)
         meta = meta | {"black": hints.black}
-    return Recording(shape, lambda a, b: marked(a, b)[0], source, None, "", meta, marked, white, assumed)
+    whole = full != float("inf")
+    return Recording(
+        shape, lambda a, b: marked(a, b)[0], source, None, "", meta, marked, white, assumed, full_scale=whole
+    )
 
 
 def _without_black(path: Path, marked: Marked, black: float, transfer: str, full: float) -> Marked:

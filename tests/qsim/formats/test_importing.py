@@ -10,7 +10,6 @@ from recordings import CAPTURE, random_planes
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
-from qsim.clip.sensing import Sensing, sense
 from qsim.clip.stream import Stream
 from qsim.clip.writer import ClipWriter
 from qsim.formats import exporting, importing, video
@@ -128,22 +127,25 @@ def test_an_interrupted_import_is_not_finished_with_another_recording(tmp_path: 
     assert str(tmp_path) not in (clip.path / "clip.json").read_text()
 
 
-def test_light_that_a_clip_cannot_hold_is_told_and_counts_as_saturated(tmp_path: Path, capsys):
-    light = np.random.default_rng(0).random((2, 5, 8)).astype(np.float32)
-    light[1, 2, :2] = 1e5, 70000
+@pytest.mark.parametrize(("unit", "scale"), [(65535.0, 0.5), (1e9, 2.0**-14), (1e-9, 2.0**29), (1.0, 1.0)])
+def test_light_that_halves_cannot_hold_is_scaled(tmp_path: Path, capsys, unit: float, scale: float):
+    """16-bit light as floats was cut at 65504; the factor is a power of 2, so nothing else changes."""
+    light = (np.random.default_rng(0).uniform(0.1, 1, (2, 5, 8)) * unit).astype(np.float32)
+    light[1, 2, 0] = unit
     np.save(tmp_path / "light.npy", light)
-    for white, said in [([], "saturation not known"), (["--white", "80000"], "white 80000: 2.5 % of pixels saturated")]:
+    for white, said in [([], "saturation not known"), (["--white", str(unit)], f"white {unit:g}: 1.25 % of pixels")]:
         line = ["convert", str(tmp_path / "light.npy"), str(tmp_path / "clip"), "--frame-rate", "1000", "--force"]
         assert main([*line, *white]) == 0
         out = capsys.readouterr().out
         assert said in out
-        assert "light above 65504, the most a clip holds, is cut off and counts as saturated: 2.5 % of pixels" in out
+        assert (f"the light of the file is scaled by {scale:g}" in out) == (scale != 1)
         clip = Clip.open(tmp_path / "clip")
-        np.testing.assert_array_equal(clip.saturated(1), light[1] > 65504)
-        assert not clip.saturated(0).any()
-        stream, _ = sense(clip, Sensing("quiver-physical", ppp=3.25))
-        np.testing.assert_array_equal(stream.known(), light <= 65504)
-        assert (stream.codes()[1, 2, :2] == stream.sensor.levels - 1).all()  # still the brightest there is
+        assert clip.meta["source"].get("scale", 1.0) == scale
+        np.testing.assert_allclose([clip.radiance(t) for t in range(2)], light * scale, rtol=2.0**-11)
+        assert int(clip.meta.get("saturated_pixels", 0)) == len(white) // 2
+
+
+def test_deep_pictures_are_not_cut(tmp_path: Path, capsys):
     np.save(tmp_path / "deep.npy", np.full((2, 5, 8), 65530, np.uint16))
     line = ["convert", str(tmp_path / "deep.npy"), str(tmp_path / "deep"), "--frame-rate", "9", "--transfer", "linear"]
     assert main([*line, "--white", "65520"]) == 0

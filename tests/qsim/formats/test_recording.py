@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import raw_planes
 from recordings import CAPTURE, everything, random_planes
+from sdt_files import sdt_bytes
 
 from qsim.clip.sensing import Sensing, sense
 from qsim.file_order import numbered
@@ -107,6 +109,13 @@ def sample(folder: Path, layout: str) -> tuple[Path, Hints]:
         path = folder / "a.h5"
         with pytest.importorskip("h5py").File(path, "w") as file:
             file["entry/data"] = planes_.astype(bool)
+    elif layout in ("ptu", "sdt"):
+        pytest.importorskip(f"{layout}file")
+        path = folder / f"a.{layout}"
+        if layout == "ptu":
+            pytest.importorskip("ptufile").imwrite(path, np.ones((2, 4, 4, 1, 4), np.uint16), 1e-7, 1e-8)
+        else:
+            path.write_bytes(sdt_bytes(np.ones((1, 4, 4, 4))))
     elif layout == "mraw":
         path = folder / "a.mraw"
         path.write_bytes(bytes(2 * 16 * 16))
@@ -140,7 +149,7 @@ def test_every_reader_says_bit_order_and_orientation(tmp_path: Path, layout: str
     (tmp_path / "in").mkdir()
     recording = importing.read(*sample(tmp_path / "in", layout))
     make = importing.to_clip if recording.is_light else importing.to_stream
-    made = make(recording, tmp_path / "made", CAPTURE)
+    made = make(recording, tmp_path / "made", replace(CAPTURE, frame_rate=recording.frame_rate or 1000.0))
     order, rows = promised()[layout]
     assert recording.meta["bit_order"].startswith(order)
     assert recording.meta["orientation"].startswith(rows)
