@@ -170,7 +170,10 @@ def _arrays(path: Path) -> dict[str, Array]:
         if set(sizes) != {f"{name}.npy" for name in _ARRAYS} or any(
             item.compress_type != zipfile.ZIP_STORED for item in archive.infolist()
         ):
-            raise ValueError(f"{path}: holds {', '.join(sorted(sizes)) or 'nothing'}, not {', '.join(_ARRAYS)}")
+            raise ValueError(
+                f"{path}: holds {', '.join(sorted(sizes)) or 'nothing'}; an .npz is read as photon times ("
+                f"{', '.join(_ARRAYS)}), so save frames alone, with np.save as .npy"
+            )
         found: dict[str, Any] = {}
         for name, kind in _ARRAYS.items():
             with archive.open(f"{name}.npy") as file:

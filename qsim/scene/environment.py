@@ -85,7 +85,14 @@ def environment_map(light: EnvironmentImage, *, colours: bool = False) -> Array:
     if picture.ndim == 3:
         picture = picture[..., :3] if colours and picture.shape[2] >= 3 else luminance(picture[..., :3])
     where = light.image if isinstance(light.image, str) else "EnvironmentImage.image"
-    if picture.ndim not in (2, 3) or picture.size == 0 or not np.isfinite(picture).all():
+    if picture.ndim in (2, 3) and not np.isfinite(picture).all():
+        bad = np.argwhere(~np.isfinite(picture))
+        y, x = (int(i) for i in bad[0][:2])
+        raise ValueError(
+            f"{where}: {len(np.unique(bad[:, :2], axis=0))} pixels are infinite or NaN, the first at (y, x) = "
+            f"({y}, {x}); replace them by the largest true radiance"
+        )
+    if picture.ndim not in (2, 3) or picture.size == 0:
         raise ValueError(f"{where}: expected finite radiance [H, W] of at least 0, found shape {picture.shape}")
     if picture.min() < -RINGING * abs(picture.mean()):
         raise ValueError(f"{where}: expected finite radiance [H, W] of at least 0, found {picture.min():.3g}")

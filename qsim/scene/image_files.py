@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,8 @@ def read_colour(path: Path) -> np.ndarray:
 
 
 def _linear(path: Path) -> np.ndarray:
-    """Return linear colours [H, W, 3]; grey pictures count with all their 16 bits, colours with the upper 8."""
-    from PIL import Image
+    """Return linear colours [H, W, 3], upright; grey counts with all its 16 bits, colours with the upper 8."""
+    from PIL import Image, ImageOps
 
     if not path.is_file():
         raise FileNotFoundError(f"texture {path}: no such file")
@@ -34,9 +35,10 @@ def _linear(path: Path) -> np.ndarray:
                     f"texture {path}: holds floating-point numbers, whose white is unknown; store 8 or 16 bits, or "
                     "give Texture an array of linear values"
                 )
-            if not opened.mode.startswith("I"):
-                return to_linear(np.asarray(opened.convert("RGB")), "srgb", 255)
-            grey = np.asarray(opened)
+            upright = ImageOps.exif_transpose(opened)  # as its orientation tag states
+            if not upright.mode.startswith("I"):
+                return to_linear(np.asarray(upright.convert("RGB")), "srgb", 255)
+            grey = np.asarray(upright)
     except (OSError, Image.DecompressionBombError) as error:
         raise ValueError(f"texture {path}: not a readable image ({error})") from error
     if grey.min() < 0 or grey.max() > 65535:
@@ -53,23 +55,26 @@ def read_hdr(path: Path) -> Array:
     import OpenEXR
 
     try:
-        channels = OpenEXR.File(str(path)).channels()
+        parts = [part.channels for part in OpenEXR.File(str(path)).parts]
     except Exception as error:  # the binding raises several types for a bad file
         raise ValueError(f"environment {path}: not a readable OpenEXR file ({error})") from error
-    for name in ("RGB", "RGBA", "Y"):
-        if name in channels:
-            return np.asarray(channels[name].pixels, np.float32)
-    raise ValueError(f"environment {path}: has channels {sorted(channels)}, expected RGB or Y")
+    pictures = [part[name] for part in parts for name in ("RGB", "RGBA", "Y") if name in part]
+    if len(pictures) == 1:
+        return np.asarray(pictures[0].pixels, np.float32)
+    if len(pictures) > 1:
+        raise ValueError(f"environment {path}: has {len(pictures)} parts with a picture; save the one to use alone")
+    raise ValueError(f"environment {path}: has channels {[sorted(part) for part in parts]}, expected RGB or Y")
 
 
 def _read_radiance(path: Path) -> Array:
-    """Decode Radiance RGBE (Ward, "Real pixels", Graphics Gems II, 1991), flat or with new-style run lengths.
+    """Decode Radiance RGBE (Ward, "Real pixels", Graphics Gems II, 1991), flat or with run lengths, old or new.
 
     Pixels are divided by the exposures of the header, which programs have multiplied into them.
     """
     content = path.read_bytes()
-    head, _, rest = content.partition(b"\n\n")
-    size, _, body = rest.partition(b"\n")
+    lines = re.match(rb"(#\?.*?)\r?\n\r?\n([^\n]*)\n", content, re.DOTALL)
+    head, size = (b"", b"") if lines is None else (lines[1].replace(b"\r\n", b"\n"), lines[2])
+    body = b"" if lines is None else content[lines.end() :]
     words = size.split()
     if not head.startswith(b"#?") or len(words) != 4 or (words[0], words[2]) != (b"-Y", b"+X"):
         raise ValueError(f"environment {path}: not a Radiance .hdr file with rows from top to bottom")
@@ -77,9 +82,10 @@ def _read_radiance(path: Path) -> Array:
     height, width = int(words[1]), int(words[3])
     rgbe = np.empty((height, width, 4), np.uint8)
     at = 0
+    old = re.search(rb"\x01\x01\x01", body) is not None and body[:2] != b"\x02\x02"
     try:
         for y in range(height):
-            at = _read_row(body, at, rgbe[y])
+            at = _read_old_row(body, at, rgbe[y]) if old else _read_row(body, at, rgbe[y])
     except (IndexError, ValueError) as error:
         raise ValueError(f"environment {path}: damaged at byte {len(content) - len(body) + at}") from error
     scale = np.ldexp(1.0, rgbe[..., 3].astype(np.int32) - 136)
@@ -107,6 +113,24 @@ def _positive(path: Path, value: str) -> float:
     if not 0 < number < math.inf:
         raise ValueError(f"environment {path}: EXPOSURE={value} in its header is not a positive number; correct it")
     return number
+
+
+def _read_old_row(body: bytes, at: int, row: Array) -> int:
+    """Read pixels of which (1, 1, 1, n) repeats the one before; a second such pixel counts 256 times as much."""
+    x, shift = 0, 0
+    while x < len(row):
+        pixel = np.frombuffer(body, np.uint8, 4, at)
+        at += 4
+        if tuple(pixel[:3]) != (1, 1, 1):
+            row[x] = pixel
+            x, shift = x + 1, 0
+            continue
+        count = int(pixel[3]) << shift
+        if not 0 < x + count <= len(row) or x == 0:
+            raise ValueError("a run beyond the row")
+        row[x : x + count] = row[x - 1]
+        x, shift = x + count, shift + 8
+    return at
 
 
 def _read_row(body: bytes, at: int, row: Array) -> int:

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from qsim.colour import to_linear
 from qsim.scene import Texture
-from qsim.scene.image_files import read_hdr
+from qsim.scene.image_files import read_grey, read_hdr
 
 
 def test_texture_files_become_linear_light(tmp_path):
@@ -91,3 +92,60 @@ def test_the_exposures_of_a_radiance_file_are_divided_out(tmp_path):
 def test_headers_of_other_pixels_and_exposures_are_refused(tmp_path, line, message):
     with pytest.raises(ValueError, match=message):
         read_hdr(radiance_file(tmp_path / "x.hdr", line))
+
+
+def rgbe_file(path: Path, body: bytes, size: tuple[int, int], line: str = "\n") -> Path:
+    head = line.join(["#?RADIANCE", "FORMAT=32-bit_rle_rgbe", "", f"-Y {size[0]} +X {size[1]}", ""])
+    path.write_bytes(head.encode() + body)
+    return path
+
+
+def test_old_run_lengths_and_line_ends_of_windows_are_read(tmp_path: Path):
+    """A repeat of (1, 1, 1, n) counts n pixels, a second one in a row 256 n more."""
+    pixels = np.array([[200, 100, 50, 129], [128, 255, 3, 120]], np.uint8)
+    row = pixels[0].tobytes() + bytes([1, 1, 1, 43]) + bytes([1, 1, 1, 1]) + pixels[1].tobytes()  # 1 + 43 + 256 + 1
+    expected = pixels[[0] * 300 + [1]]
+    flat = np.stack([expected, expected]).tobytes()
+    for body, line in ((row + row, "\n"), (flat, "\n"), (flat, "\r\n"), (row + row, "\r\n")):
+        found = read_hdr(rgbe_file(tmp_path / "a.hdr", body, (2, 301), line))
+        right = np.ldexp(expected[:, :3].astype(float), expected[:, 3:].astype(int) - 136)
+        np.testing.assert_allclose(found, np.stack([right, right]), rtol=1e-6)
+    for body in (
+        row + row[:-1],
+        bytes([1, 1, 1, 5]) + row + row,
+        row + pixels[0].tobytes() + bytes([1, 1, 1, 255]) * 2,
+    ):
+        with pytest.raises(ValueError, match=r"a\.hdr: damaged at byte"):
+            read_hdr(rgbe_file(tmp_path / "a.hdr", body, (2, 301)))
+
+
+def test_parts_of_an_exr_are_looked_through(tmp_path: Path):
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    colours = np.random.default_rng(0).random((4, 6, 3)).astype(np.float32)
+
+    def part(name: str, channels: dict) -> OpenEXR.Part:
+        return OpenEXR.Part(dict(header), channels, name)
+
+    depth, picture = {"Z": colours[..., 0].copy()}, {"RGB": colours}
+    OpenEXR.File([part("depth", depth), part("beauty", picture)]).write(str(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(read_hdr(tmp_path / "a.exr"), colours)
+    OpenEXR.File([part("left", picture), part("right", picture)]).write(str(tmp_path / "b.exr"))
+    with pytest.raises(ValueError, match="has 2 parts with a picture; save the one to use alone"):
+        read_hdr(tmp_path / "b.exr")
+
+
+def test_photographs_stand_upright(tmp_path: Path):
+    """As Pillow turns them; JPEG and PNG of cameras state it in their EXIF."""
+    from PIL import Image, ImageOps
+
+    pixels = np.random.default_rng(0).integers(0, 256, (16, 24), np.uint8)
+    for ending in ("png", "jpg"):
+        exif = Image.Exif()
+        exif[274] = 6
+        Image.fromarray(pixels).save(tmp_path / f"a.{ending}", exif=exif)
+        with Image.open(tmp_path / f"a.{ending}") as opened:
+            expected = np.asarray(ImageOps.exif_transpose(opened))
+        assert read_grey(tmp_path / f"a.{ending}").shape == (24, 16)
+        np.testing.assert_allclose(read_grey(tmp_path / f"a.{ending}"), to_linear(expected, "srgb", 255), rtol=1e-5)
