@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qsim.arrays import plain
+
 TRANSFERS = ("linear", "srgb", "gamma 2.2")
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue: ITU-R BT.709
 GAMMA = 2.2  # of the tone curve of every picture
@@ -19,7 +21,7 @@ AVERAGE = 11  # frames of a naive mean, the window of QUIVER
 
 def to_linear(values: NDArray[Any], transfer: str, top: float) -> NDArray[Any]:
     """Return linear light, float32 in 0..1, of coded values 0 ... top (IEC 61966-2-1 for srgb)."""
-    coded = np.asarray(values, np.float32) / np.float32(top)
+    coded = plain(values, np.float32) / np.float32(top)
     if transfer == "linear":
         return coded
     if transfer == "gamma 2.2":
@@ -31,7 +33,7 @@ def to_linear(values: NDArray[Any], transfer: str, top: float) -> NDArray[Any]:
 
 def from_linear(light: NDArray[Any], transfer: str, top: int) -> NDArray[Any]:
     """Return coded values 0 ... top, rounded, of linear light in 0..1 (clipped): the inverse of `to_linear`."""
-    light = np.clip(np.asarray(light, np.float64), 0, 1)
+    light = np.clip(plain(light, np.float64), 0, 1)
     if transfer == "linear":
         coded = light
     elif transfer == "gamma 2.2":
@@ -74,7 +76,7 @@ def tone(linear: NDArray[np.floating], peak: float) -> NDArray[np.uint8]:
     """Return linear light as 8-bit grey: 255 (v / peak)^(1/2.2), clipped to 0 ... peak and rounded; NaN is black."""
     if not peak > 0:
         raise ValueError(f"tone: the peak must be positive, got {peak!r}")
-    scaled = np.clip(np.nan_to_num(np.asarray(linear, np.float64)) / peak, 0.0, 1.0)
+    scaled = np.clip(np.nan_to_num(plain(linear, np.float64)) / peak, 0.0, 1.0)
     return np.rint(255.0 * scaled ** (1 / GAMMA)).astype(np.uint8)
 
 

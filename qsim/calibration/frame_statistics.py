@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
+
 
 @dataclass(frozen=True, eq=False)
 class FrameStatistics:
@@ -179,7 +181,7 @@ def as_codes(block: Array, bits: int, name: str, frame: int) -> Array:
 
 def _as_values(block: Array, top: int, what: str, name: str, frame: int) -> Array:
     """Return a block of values 0 ... `top` as integers [t, H, W]."""
-    block = np.asarray(block)
+    block = plain(block)
     block = block[None] if block.ndim == 2 else block
     if block.ndim != 3 or block.size == 0:
         raise ValueError(f"{name}: expected frames [t, H, W] with at least one pixel, got shape {block.shape}")

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from qsim.files import decoding_errors
 from qsim.optics.radiometry import Crop
 
@@ -33,7 +34,7 @@ def encode(channels: dict[str, Array], *, compress: bool = False) -> bytes:
     """Return an EXR file of channels [H, W] of float16, float32 or uint32, uncompressed or losslessly zipped."""
     names = sorted(channels)
     height, width = channels[names[0]].shape
-    arrays = [np.ascontiguousarray(channels[name]) for name in names]
+    arrays = [plain(channels[name]) for name in names]
     header = _header({name: array.dtype for name, array in zip(names, arrays, strict=True)}, height, width, compress)
     rows = np.concatenate([array.view(np.uint8).reshape(height, -1) for array in arrays], axis=1)
     step = _ZIP_ROWS if compress else 1

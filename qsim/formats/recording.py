@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from qsim.colour import TRANSFERS, to_linear
 
 Marked = Callable[[int, int], tuple[Array, Array]]
@@ -52,6 +53,13 @@ class Recording:
     reading: str = ""  # how the bytes or axes were read, in words; empty: only one way is known
     times: Times | None = None  # of the frames, if the file states them
     full_scale: bool = True  # light of whole numbers, at most 1; False: of floats, in any unit
+
+    def __post_init__(self) -> None:
+        """Make every reader's arrays plain, whatever memory its library returns (arrays.py)."""
+        read, marked = self.read, self.marked
+        object.__setattr__(self, "read", lambda start, stop: plain(read(start, stop)))
+        if marked is not None:
+            object.__setattr__(self, "marked", lambda start, stop: tuple(plain(part) for part in marked(start, stop)))
 
     @property
     def is_light(self) -> bool:

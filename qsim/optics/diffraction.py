@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from qsim.optics.camera import Camera
 
 NEAR = 31  # px: where a lone point takes pixels below 0, the light that lifts them to 0 comes from this square
@@ -57,7 +58,7 @@ def blurred(image: Array, camera: Camera) -> Array:
 
     down, across = (np.arange(size) / (2 * size) for size in image.shape)  # cycles/px of a cosine transform
     contrast = mtf(np.hypot(down[:, None], across), camera)
-    spectrum = fft.dctn(np.asarray(image, np.float64), norm="ortho")
+    spectrum = fft.dctn(plain(image, np.float64), norm="ortho")
     answer: Array = fft.idctn(spectrum * contrast, norm="ortho")
     return answer
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
 from qsim.structure import LARGEST, SMALLEST
@@ -73,7 +74,7 @@ def expected_photons(
     """
     if not exposure > 0:
         raise ValueError(f"exposure: expected seconds above 0, got {exposure!r}; a full frame time at 2000 fps is 5e-4")
-    radiance = np.asarray(radiance, np.float64)
+    radiance = plain(radiance, np.float64)
     cosines: float | Array = 1.0
     if (camera.vignetting or camera.lens is not None) and radiance.ndim >= 2:
         height, width = radiance.shape[-2:]

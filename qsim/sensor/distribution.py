@@ -24,6 +24,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from qsim.keys import uniform, uniform_pair
 
 
@@ -78,7 +79,7 @@ class Distribution(ABC):
         `ValueError` names the first value of `photons` that is negative or not finite.
         """
         check_exposure(exposure)
-        values = np.asarray(photons, np.float64)
+        values = plain(photons, np.float64)
         wrong = ~(np.isfinite(values) & (values >= 0))
         if wrong.any():
             where = tuple(int(i) for i in np.argwhere(wrong)[0])
@@ -126,7 +127,7 @@ class Distribution(ABC):
 
     def log_likelihood(self, codes: Array, photons: Array, exposure: float) -> Array:
         """Return log P(code | photons) of each code, in the broadcast shape of the two."""
-        codes = np.asarray(codes)
+        codes = plain(codes)
         if codes.size and not (codes.dtype.kind in "ui" and codes.min() >= 0 and codes.max() < self.levels):
             raise ValueError(f"codes are integers 0 ... {self.levels - 1} of this {self.bits}-bit sensor")
         table = self.log_pmf(photons, exposure)

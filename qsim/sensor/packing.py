@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
+
 MAX_BITS = 16
 
 
@@ -49,6 +51,7 @@ def index_text(index: tuple[int, ...]) -> str:
 
 def pack(codes: Array, bits: int) -> Array:
     """Return packed bytes [..., ceil(W * bits / 8)] of codes [..., W]; `ValueError` if a code does not fit."""
+    codes = plain(codes)
     check(codes, bits)
     if bits == 1:
         return np.packbits(codes, axis=-1)
@@ -79,6 +82,7 @@ def unpack(packed: Array, bits: int, width: int) -> Array:
     by `packbits` takes eleven times as long (measured: 41 ms against 3.6 for 8 x 512 x 1024 codes of 3 bits).
     """
     _check_bits(bits)
+    packed = plain(packed)
     if packed.dtype != np.uint8 or packed.ndim == 0:
         raise ValueError(f"packed codes: expected an array of uint8, found {packed.ndim} axes of {packed.dtype}")
     needed = packed_width(width, bits)
@@ -92,7 +96,7 @@ def unpack(packed: Array, bits: int, width: int) -> Array:
     if bits == 8:
         return packed.copy()
     if bits == 16:
-        return np.ascontiguousarray(packed).view(">u2").astype(np.uint16)
+        return packed.view(">u2").astype(np.uint16)
     groups = -(-width // 8)
     padded = np.zeros((*packed.shape[:-1], groups * bits), np.uint8)
     padded[..., :needed] = packed

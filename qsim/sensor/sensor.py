@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from qsim.keys import Key, words, words_at
 from qsim.sensor import estimation
 from qsim.sensor.compiled.plan import Plan
@@ -62,7 +63,7 @@ class Sensor(Distribution):
         histograms the estimate is finite and the bound one-sided (see Estimate). `ValueError` for an empty histogram.
         Where the mean code falls again with light (paralyzable pixels) the answer is the darker of the two.
         """
-        return estimation.maximum_likelihood(self, histogram, exposure, confidence)
+        return estimation.maximum_likelihood(self, plain(histogram), exposure, confidence)
 
     def response(self, exposure: float, points: int = estimation.POINTS) -> Response:
         """Return mean and variance of the code at `points` levels of light, and the inverse."""
@@ -131,6 +132,7 @@ class Sensor(Distribution):
         `torch.from_dlpack` makes a torch tensor of it without a copy. Photons [T, H, W] are float32; an array of a
         library that knows DLPack stays on its device. `ValueError` for a sensor or machine without a compiled engine.
         """
+        photons = plain(photons) if isinstance(photons, np.ndarray) else photons
         shape, plan = tuple(map(int, photons.shape)), None
         check_exposure(exposure)
         if len(shape) != 3 or not 0 < prod(shape) < 1 << 32 or "float32" not in str(photons.dtype):
@@ -210,7 +212,7 @@ class Sensor(Distribution):
 
 def _checked(photons: Array, engine: str) -> Array:
     """Return photons as an array of frames; `ValueError` for another shape or an unknown engine."""
-    photons = np.asarray(photons)
+    photons = plain(photons)
     if photons.ndim not in (2, 3):
         raise ValueError(f"photons have the shape [H, W] or [T, H, W], got {list(photons.shape)}")
     if engine not in ENGINES:

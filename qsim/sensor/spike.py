@@ -21,6 +21,7 @@ from typing import ClassVar
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from qsim.keys import Key, uniform, uniform_pair, words
 from qsim.sensor.distribution import check_exposure, require_number
 from qsim.sensor.poisson import poisson_log_pmf, poisson_quantile
@@ -116,7 +117,7 @@ class SpikeCamera(Sensor):
 
         The first plane begins with a random charge. There is one engine, exact in float64. `exposure` in seconds.
         """
-        photons = np.asarray(photons)
+        photons = plain(photons)
         stack = photons if photons.ndim == 3 else photons[None]
         if stack.ndim != 3:
             raise ValueError(f"photons have the shape [H, W] or [T, H, W], got {list(photons.shape)}")

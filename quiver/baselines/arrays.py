@@ -46,11 +46,15 @@ def mixed(first: Any, second: Any, share: Any) -> Any:
 
 
 def strided(values: Any, shape: tuple[int, ...], strides: tuple[int, ...], offset: int = 0) -> Any:
-    """Return a view of a contiguous array from an offset on; strides and offset count elements."""
+    """Return a view of an array from an offset on; strides and offset count elements of its C order.
+
+    An array of another order is copied first: strides of C order on its memory would mix its rows.
+    """
     if TORCH:
-        return values.as_strided(shape, strides, offset)
+        return values.contiguous().as_strided(shape, strides, offset)
     size = values.itemsize
-    return np.lib.stride_tricks.as_strided(values.reshape(-1)[offset:], shape, [size * stride for stride in strides])
+    flat = np.ascontiguousarray(values).reshape(-1)[offset:]
+    return np.lib.stride_tricks.as_strided(flat, shape, [size * stride for stride in strides])
 
 
 def smallest(values: Any, count: int) -> tuple[Any, Any]:

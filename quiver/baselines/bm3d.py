@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from quiver.baselines.arrays import add_at, single, smallest, strided, whole, xp, zeros
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ def denoise(image: Array, sigma: float, *, peak: float = 1.0, profile: Profile =
     `peak` is the image value that stands for 255 grey levels, the unit of the profile's limits. `ValueError` for input
     that is not an image, and for an impossible deviation.
     """
+    image = plain(image)
     if image.ndim != 2 or image.size == 0 or not np.all(np.isfinite(image)):
         raise ValueError(f"image: expected finite numbers [H, W], got {image.dtype} {image.shape}")
     if not (sigma >= 0 and np.isfinite(sigma) and peak > 0):

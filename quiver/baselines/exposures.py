@@ -22,7 +22,7 @@ from qsim.sensor.estimation import pieces
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from quiver.baselines.naive_mean import dark_codes
-from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_frames
+from quiver.baselines.sliding_window import check_window, checked_codes, in_units, window_frames
 
 GRID = 1024  # levels of light from DARKEST on; a parabola through the best three errs by less than 1e-3 of the light
 DARKEST = 1e-5  # of the brightest light: the first level above darkness
@@ -51,7 +51,7 @@ def restore(
     `window` frames around each are used. `ValueError` for codes that the sensor cannot produce, an empty window, and a
     method without exposures.
     """
-    check_codes(codes, sensor)
+    codes = checked_codes(codes, sensor)
     check_window(window)
     if method not in METHODS:
         raise ValueError(f"method {method!r}: takes equal exposures only; use {', '.join(METHODS)} for this stream")

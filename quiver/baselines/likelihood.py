@@ -16,7 +16,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.sensor.sensor import Sensor
-from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_frames
+from quiver.baselines.sliding_window import check_window, checked_codes, in_units, window_frames
 
 CHUNK = 1 << 22  # entries of the histograms solved at a time
 
@@ -35,7 +35,7 @@ def restore(
     It is quick up to about 4 bits; above, nearly every pixel has a different outcome. `ValueError` for codes that the
     sensor cannot produce and for an empty window.
     """
-    check_codes(codes, sensor)
+    codes = checked_codes(codes, sensor)
     check_window(window)
     cap = sensor.response(exposure).cap(window)
     names = outcome_names(sensor.levels, window)

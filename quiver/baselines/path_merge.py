@@ -31,7 +31,7 @@ from qsim.sensor.sensor import Sensor
 from quiver.baselines.information_domain import FLOOR, InformationDomain, information_domain
 from quiver.baselines.paths.motion_paths import paths
 from quiver.baselines.paths.moved_frames import SCALES, box_mean, displacement, enlarged, look
-from quiver.baselines.sliding_window import check_codes, check_window, in_units, look_ahead
+from quiver.baselines.sliding_window import check_window, checked_codes, in_units, look_ahead
 
 # (cells of 2 x 2 px beside the own one whose mean difference is squared, and over which squares are averaged; statistic
 # up to which frames agree; excess over it at which a frame has half its weight)
@@ -179,7 +179,7 @@ def restore(
 
     `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
     """
-    check_codes(codes, sensor)
+    codes = checked_codes(codes, sensor)
     check_window(window)
     domain, table = information_domain(sensor, exposure), sensor.response(exposure)
     frames = range(len(codes)) if frames is None else frames

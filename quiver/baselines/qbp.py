@@ -33,7 +33,7 @@ from qsim.sensor.estimation import Response
 from qsim.sensor.sensor import Sensor
 from quiver.baselines import bm3d, patch_alignment
 from quiver.baselines.arrays import add_at, mixed, single, whole, xp, zeros
-from quiver.baselines.sliding_window import check_codes, check_window, in_units, look_ahead
+from quiver.baselines.sliding_window import check_window, checked_codes, in_units, look_ahead
 from quiver.baselines.vst import stabiliser
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def restore(
     With `excess`, merged frames are denoised by BM3D. `ValueError` for codes that the sensor cannot produce, an
     impossible unit, and a window that is not a multiple of the block.
     """
-    check_codes(codes, sensor)
+    codes = checked_codes(codes, sensor)
     check_window(window)
     table = sensor.response(exposure)
     frames = range(len(codes)) if frames is None else frames

@@ -14,11 +14,16 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from qsim.sensor.sensor import Sensor
 
 
-def check_codes(codes: Array, sensor: Sensor) -> None:
-    """Raise `ValueError` unless `codes` is a non-empty integer stack [T, H, W] that this sensor can produce."""
+def checked_codes(codes: Array, sensor: Sensor) -> Array:
+    """Return codes [T, H, W] as a plain array (qsim/arrays.py).
+
+    `ValueError` unless they are a non-empty integer stack that this sensor can produce.
+    """
+    codes = plain(codes)
     if codes.ndim != 3 or codes.size == 0 or not np.issubdtype(codes.dtype, np.integer):
         raise ValueError(f"codes: expected integers [T, H, W] with at least one frame, got {codes.dtype} {codes.shape}")
     if codes.max() >= sensor.levels or codes.min() < 0:
@@ -28,6 +33,7 @@ def check_codes(codes: Array, sensor: Sensor) -> None:
             f"codes: expected 0..{sensor.levels - 1} for a {sensor.bits}-bit sensor, "
             f"found {codes[where]} at (t, y, x) = {where}"
         )
+    return codes
 
 
 def check_window(window: int) -> None:
@@ -93,7 +99,7 @@ def restore_by_mean(
     A sum of codes has few values. So the method is one table, `photons_of` every possible mean code, and a running sum.
     `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
     """
-    check_codes(codes, sensor)
+    codes = checked_codes(codes, sensor)
     check_window(window)
     top = sensor.levels - 1
     table = photons_of(np.arange(window * top + 1) / window).astype(np.float32)

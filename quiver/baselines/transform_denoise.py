@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 
 from qsim.sensor.sensor import Sensor
 from quiver.baselines import bm3d
-from quiver.baselines.sliding_window import check_codes, check_window, frame_times, in_units, window_sums
+from quiver.baselines.sliding_window import check_window, checked_codes, frame_times, in_units, window_sums
 from quiver.baselines.vst import Kind, stabiliser
 
 
@@ -34,7 +34,7 @@ def restore(
 
     `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
     """
-    check_codes(codes, sensor)
+    codes = checked_codes(codes, sensor)
     check_window(window)
     top = sensor.levels - 1
     frames = range(len(codes)) if frames is None else frames

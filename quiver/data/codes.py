@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from qsim.clip.clip import Clip
 from qsim.clip.lazy_array import LazyArray
 from qsim.clip.photons import clip_photons
@@ -185,10 +186,10 @@ def _pooled(image: Array) -> tuple[Array, Array]:
 
 def array_digest(array: Array) -> str:
     """Return the SHA-256 of an array's type, shape and values. A memory map is read in blocks."""
-    found = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
+    found = hashlib.sha256(f"{array.dtype.newbyteorder('=').str} {array.shape}".encode())
     step = max(1, DIGEST_BYTES // max(1, array[:1].nbytes))
     for start in range(0, len(array), step):
-        found.update(np.ascontiguousarray(array[start : start + step]).data)
+        found.update(plain(array[start : start + step]).data)
     return found.hexdigest()
 
 
@@ -202,7 +203,7 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
         )
 
     def read(start: int, stop: int) -> Array:
-        part = np.asarray(codes[start:stop])
+        part = plain(codes[start:stop])
         if part.max() >= sensor.levels or part.min() < 0:
             t, y, x = (int(i) for i in np.argwhere((part < 0) | (part >= sensor.levels))[0])
             raise ValueError(

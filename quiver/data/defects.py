@@ -22,6 +22,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files, keys
+from qsim.arrays import plain
 from qsim.clip.simulation import Draw
 from qsim.clip.stream import Stream
 from qsim.keys import Key
@@ -111,4 +112,4 @@ def check_map(array: Array, name: str) -> Array:
             f"{name}: a map of defective pixels is [H, W] of booleans, or of 0 and 1, and this is {array.dtype} "
             f"{list(array.shape)}; compare measured dark counts with a limit first"
         )
-    return np.asarray(array, bool)
+    return plain(array, bool)

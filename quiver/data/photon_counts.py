@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from qsim.files import decoding_errors, load_array, read_npy
 
 LARGEST = 1 << 32  # bytes of an array of counts in a .npz
@@ -37,7 +38,7 @@ def read_counts(path: Path) -> Counts:
     if path.suffix not in (".npy", ".npz"):
         raise ValueError(f"{path}: photon counts are a .npy, or a .npz with one array")
     with decoding_errors(path, "an array of numbers"):
-        array = _load(path)
+        array = plain(_load(path))
     if array.ndim not in (3, 4) or array.size == 0 or not np.issubdtype(array.dtype, np.integer) or array.min() < 0:
         raise ValueError(
             f"{path}: expected whole counts [N, H, W] or [T, K, H, W], got {array.dtype} {list(array.shape)}"

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
 from qsim.files import load_array
 from qsim.sensor.spad import BinarySPAD
 from quiver.data.codes import Codes, array_codes, array_digest
@@ -85,6 +86,6 @@ def sum_planes(cube: Array, width: int, start: int, stop: int, bits: int) -> Arr
     together = max(1, PLANE_PIXELS // (cube.shape[1] * width))  # planes unpacked at a time
     total = np.zeros((cube.shape[1], width), np.uint16)  # at most 65535
     for first in range(start, stop, together):
-        part = cube[first : min(first + together, stop)]
+        part = plain(cube[first : min(first + together, stop)])
         total += np.unpackbits(part, axis=2, count=width).sum(axis=0, dtype=np.uint16)
     return total.astype(np.uint8 if bits <= 8 else np.uint16)

@@ -19,6 +19,7 @@ from math import inf, isfinite, nan, pi, sqrt
 import numpy as np
 
 from qsim import colour
+from qsim.arrays import plain
 
 SSIM_WINDOW = 7  # px; uniform window and sample covariance are the defaults of the field
 FACTORS = (0.01, 100.0)  # limits of the search for the best factor
@@ -47,7 +48,7 @@ class Score:
 
 def _stack(name: str, image: np.ndarray) -> np.ndarray:
     """Return float64 [T, H, W] or [T, 3, H, W]. `ValueError` with the first index of NaN or Inf, or the shape."""
-    stack = np.asarray(image, dtype=np.float64)
+    stack = plain(image, np.float64)
     stack = stack[None] if stack.ndim == 2 else stack
     if stack.ndim not in (3, 4) or stack.size == 0:
         raise ValueError(
@@ -92,7 +93,7 @@ def above_peak_warning(what: str, share: float) -> str:
 def _kept(valid: np.ndarray | None, like: np.ndarray) -> np.ndarray | None:
     if valid is None:
         return None
-    keep = np.asarray(valid)
+    keep = plain(valid)
     keep = keep[None] if keep.ndim == 2 else keep
     if keep.shape != like.shape or keep.dtype != bool:
         raise ValueError(f"valid: expected bool {list(like.shape)}, got {keep.dtype} {list(keep.shape)}")

@@ -14,6 +14,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files
+from qsim.arrays import plain
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.correlated_noise import CorrelatedNoise
@@ -139,7 +140,7 @@ class PixelArray:
         """Return codes [t, H, W] of a block, and the memory [H, W] for the next; `before` is that of the last."""
         clocked = isinstance(self.sensor, BinarySPAD)
         noise = CorrelatedNoise(self.defects.afterpulse if clocked else 0.0, self.defects.crosstalk)
-        stack = np.asarray(photons)
+        stack = plain(photons)
         if stack.ndim != 3:
             raise ValueError(f"photons have the shape [T, H, W], got {list(stack.shape)}")
         if noise.crosstalk and isinstance(self.sensor, QIS):
