@@ -1,6 +1,6 @@
-"""Reads and writes files: atomic writes (temporary file, fsync, rename), checksums, JSON, TOML and arrays.
+"""Reads and writes files: atomic writes (scratch folder, fsync, rename), checksums, JSON, TOML and arrays.
 
-    write_bytes / write_json:  NAME.tmp-PID -> fsync -> rename
+    write_bytes / write_json:  .qsim-TOKEN/0 (scratch.py) -> fsync -> rename
 
 A killed writer leaves nothing that a reader accepts. All files of `qsim` are written here, and tests inject a full
 disk here.
@@ -16,8 +16,9 @@ import json
 import os
 import re
 import shutil
+import stat
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import IO, Any, BinaryIO
@@ -25,6 +26,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 
 from qsim.parsing import parse_json, parse_toml
+from qsim.scratch import Scratch, is_scratch, sweep
 
 Progress = Callable[[int, int], None]  # is called with (done, total)
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")  # of clips and streams: a safe file name
@@ -53,7 +55,7 @@ def sha256(source: bytes | memoryview | Path) -> str:
 
 def sync_folder(folder: Path) -> None:
     """Sync a folder, so that renames inside it survive a power cut."""
-    with _naming(folder):
+    with naming(folder):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)
@@ -65,20 +67,11 @@ def sync_folder(folder: Path) -> None:
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """Open a binary file that appears under `path` only if the block succeeds.
 
-    An `OSError` of the system (a full disk, a folder without permission) names the file.
+    An `OSError` of the system (a full disk, a folder without permission) names the file. `ValueError` where `path` is
+    neither free nor a file: a pipe or a device is no output.
     """
-    temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}")
-    try:
-        with _naming(path, temporary):
-            with open(temporary, "wb") as file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
+    with _replacing(path) as (file,):
+        yield file
 
 
 @contextlib.contextmanager
@@ -87,39 +80,56 @@ def replacing_described(path: Path, description: Path) -> Iterator[tuple[BinaryI
 
     Both are complete and synced before the old description is deleted: it is missing during three renames only.
     """
-    parts = [file.with_name(f"{file.name}.tmp-{os.getpid()}") for file in (path, description)]
-    try:
-        with _naming(description, parts[1]), _naming(path, parts[0]):
-            with open(parts[0], "wb") as file, open(parts[1], "wb") as text:
-                yield file, text
-                for written in (file, text):
-                    written.flush()
-                    os.fsync(written.fileno())
-            description.unlink(missing_ok=True)
-            os.replace(parts[0], path)
-            os.replace(parts[1], description)
-    except BaseException:
-        for part in parts:
-            part.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
+    with _replacing(path, description) as (file, text):
+        yield file, text
+
+
+@contextlib.contextmanager
+def _replacing(*paths: Path) -> Iterator[Sequence[BinaryIO]]:
+    """Open new files; at the end of the block all but the first old file are deleted and the new ones named in turn."""
+    for path in paths:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise ValueError(f"{path}: is a pipe or a device, not a file; name another output")
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(naming(paths[0]))
+        scratch = stack.enter_context(Scratch(paths[0]))
+        parts = [scratch.new(number) for number in range(len(paths))]
+        opened = [stack.enter_context(open(part, "x+b")) for part in parts]
+        yield opened
+        for file in opened:
+            file.flush()
+            os.fsync(file.fileno())
+        for path in paths[1:]:
+            path.unlink(missing_ok=True)
+        for part, path in zip(parts, paths, strict=True):
+            os.replace(part, path)
+    sync_folder(paths[0].parent)
 
 
 def append_line(path: Path, line: bytes) -> None:
     """Append a line to a journal and sync it; a killed writer leaves at most an incomplete last line."""
-    with _naming(path), open(path, "ab") as journal:
+    with naming(path), open(path, "ab", opener=own) as journal:
         journal.write(line + b"\n")
         journal.flush()
         os.fsync(journal.fileno())
 
 
+def own(path: str, flags: int) -> int:
+    """Open a regular file without following a link in its place: an `opener` of `open`."""
+    descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "is not a regular file", path)
+    return descriptor
+
+
 @contextlib.contextmanager
-def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Put the name of the file into an `OSError` that names no file, or a temporary one."""
+def naming(path: Path) -> Iterator[None]:
+    """Put the name of the file into an `OSError` that names no file, or one in a scratch folder."""
     try:
         yield
     except OSError as error:
-        if error.errno is not None and (error.filename is None or str(error.filename) == str(temporary)):
+        if error.errno is not None and (error.filename is None or is_scratch(Path(os.fsdecode(error.filename)))):
             error.filename = str(path)
             with contextlib.suppress(AttributeError):
                 del error.filename2  # None would be printed: "-> None"
@@ -131,35 +141,6 @@ def wording(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{os.fsdecode(error.filename)}: {error.strerror}" if error.filename else error.strerror
     return " ".join(str(error).split()) or type(error).__name__
-
-
-_LEFTOVER = re.compile(r"(.+)\.(?:tmp|removed)-\d+", re.DOTALL)
-
-
-def remove_leftovers(path: Path) -> None:
-    """Delete NAME.tmp-PID and NAME.removed-PID beside `path`, which killed writers of this exact NAME left.
-
-    The caller must hold the lock that all writers of `path` take.
-    """
-    for leftover in path.parent.iterdir():
-        found = _LEFTOVER.fullmatch(leftover.name)
-        if found and found[1] == path.name:
-            _remove(leftover)
-
-
-def remove_leftovers_below(folder: Path) -> None:
-    """Delete every temporary file in `folder` and below; the caller must be the only writer there."""
-    for leftover in list(folder.rglob("*.tmp-*")):
-        if _LEFTOVER.fullmatch(leftover.name):
-            _remove(leftover)
-
-
-def _remove(path: Path) -> None:
-    """Delete a file or folder; of a symbolic link only the link."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, content: bytes | memoryview) -> str:
@@ -219,7 +200,9 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file; `ValueError` as `parse_json`, also for a file that is not text."""
+    """Return the object in a JSON file; `ValueError` as `parse_json`, also for what is no file, or no text."""
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+        raise ValueError(f"{path}: is a folder, a pipe or a device, not a file; move it away")
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -239,11 +222,14 @@ def check_version(path: Path, found: object, known: int) -> None:
 def check_ours(folder: Path, names: str) -> None:
     """Raise `FileExistsError` if a folder holds files whose relative paths do not match the pattern `names`.
 
-    Called before the folder is deleted: only files that this program wrote are replaced.
+    Called before the folder is deleted: only files that this program wrote are replaced. What killed writers left in
+    it is deleted.
     """
+    for place in [folder, *(item for item in folder.rglob("*") if item.is_dir() and not item.is_symlink())]:
+        sweep(place)
     for item in sorted(folder.rglob("*")):
         relative = item.relative_to(folder).as_posix()
-        if item.is_symlink() or not (item.is_dir() or re.fullmatch(rf"(?:{names})(?:\.tmp-.*)?", relative)):
+        if item.is_symlink() or not (item.is_dir() or re.fullmatch(rf"(?:{names})", relative)):
             raise FileExistsError(
                 f"{item}: was not made by this program, which replaces only what it made; move it away, or name "
                 "another output"
@@ -260,9 +246,9 @@ def remove_folder(folder: Path) -> None:
             f"{folder}: is a symbolic link to {os.readlink(folder)}, which is not replaced; move the folder here, "
             "or delete the link"
         )
-    doomed = folder.with_name(f"{folder.name}.removed-{os.getpid()}")
-    os.replace(folder, doomed)
-    shutil.rmtree(doomed)
+    with Scratch(folder) as scratch:
+        os.replace(folder, scratch.old)
+        shutil.rmtree(scratch.old)
 
 
 def check_name(name: Any) -> str:

@@ -1,17 +1,29 @@
-"""Locks files, exclusively or shared; the system releases a lock when its process ends."""
+"""Locks files, exclusively or shared; the system releases a lock when its process ends.
+
+A lock file appears with its content, `RECORD`, in one step. So a file, link or pipe that somebody else put under the
+name of a lock is known as such: it is refused, and neither locked nor deleted.
+"""
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
+from qsim.files import naming
+from qsim.scratch import Scratch
+
 try:
     import fcntl
 except ModuleNotFoundError:
     raise ImportError("qsim runs on Linux and macOS: it locks files by fcntl, which this system lacks") from None
+
+RECORD = b"a lock of qsim\n"
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS)  # of a file system without hard links
 
 
 class Lock:
@@ -26,10 +38,12 @@ class Lock:
         self._file: BinaryIO | None = None
 
     def acquire(self, *, wait: bool = False, on_wait: Callable[[], None] | None = None) -> bool:
-        """Take the lock. With `wait`, `on_wait` is called once before waiting for another holder."""
+        """Take the lock. With `wait`, `on_wait` is called once before waiting for another holder.
+
+        `FileExistsError` if something else than a lock is there.
+        """
         while True:
-            # The file is open while the lock is held; NFS needs it open for reading too for a shared lock.
-            file = open(self.path, "a+b")  # noqa: SIM115
+            file = self._opened()  # while the lock is held
             try:
                 try:
                     fcntl.flock(file, self.mode | fcntl.LOCK_NB)
@@ -48,6 +62,39 @@ class Lock:
                 file.close()
                 raise
             file.close()  # its holder deleted it: this lock is on a file without a name
+
+    def _opened(self) -> BinaryIO:
+        """Return the lock file, made if there is none; open for reading too, which NFS needs for a shared lock."""
+        foreign = FileExistsError(f"{self.path}: exists and is not a lock of this program; move it away")
+        while True:
+            try:
+                descriptor = os.open(self.path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+            except FileNotFoundError:
+                self._create()
+                continue
+            except OSError as error:
+                if error.errno in (errno.ELOOP, errno.EISDIR):
+                    raise foreign from None
+                raise
+            file = os.fdopen(descriptor, "r+b", buffering=0)
+            if stat.S_ISREG(os.fstat(descriptor).st_mode) and os.pread(descriptor, len(RECORD) + 1, 0) == RECORD:
+                return file
+            file.close()
+            raise foreign
+
+    def _create(self) -> None:
+        """Make the lock file in one step, unless another process made it meanwhile."""
+        with naming(self.path), Scratch(self.path) as scratch:
+            scratch.new().write_bytes(RECORD)
+            try:
+                os.link(scratch.new(), self.path)
+            except FileExistsError:
+                return
+            except OSError as error:
+                if error.errno not in _NO_LINKS:
+                    raise
+                with open(self.path, "xb") as file:
+                    file.write(RECORD)
 
     def _is_current(self, file: BinaryIO) -> bool:
         """Return whether the opened file still has its name."""

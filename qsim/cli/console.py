@@ -26,6 +26,7 @@ from qsim.checks import suggest
 from qsim.cli.options import refuse_empty
 from qsim.files import FULL, Progress, wording
 from qsim.process import peak_memory
+from qsim.scratch import sweep
 from qsim.terminal import tolerant_output
 
 SHOWN_AFTER = 2.0  # s, before a progress bar appears
@@ -234,6 +235,7 @@ def _run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
     token = quiet.set(args.quiet)
     started = time.perf_counter()
     try:
+        _sweep(getattr(args, "output", None))
         with _warnings_as_lines(parser.prog):
             return int(args.run(args))
     except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
@@ -249,6 +251,13 @@ def _run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
         if args.verbose:
             spent, memory = time.perf_counter() - started, peak_memory() / 2**30
             print(f"{parser.prog}: {spent:.1f} s, at most {memory:.2f} GiB of memory", file=sys.stderr)
+
+
+def _sweep(named: str | os.PathLike[str] | None) -> None:
+    """Delete what killed writers left beside and in the output of a command."""
+    if named is not None:
+        sweep(Path(named).parent)
+        sweep(Path(named))
 
 
 def _then(args: argparse.Namespace) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import checks, files, keys, locks
+from qsim import checks, files, keys, locks, scratch
 from qsim.clip import gates
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.photons import light_level, light_line
@@ -337,8 +337,7 @@ def write_stream(
 def _write(clip: ClipFolder, name: str, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
     """Store packed blocks as a stream of the clip; the caller holds the lock of its streams."""
     path = clip.path / "streams" / f"{check_name(name)}.npy"
-    for file in (path.with_suffix(".json"), path):
-        files.remove_leftovers(file)
+    scratch.sweep(path.parent)
     return write_packed(path, blocks, sensor, {"orientation": orientation(clip.meta)} | meta)
 
 

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files, locks
+from qsim import files, locks, scratch
+from qsim.arrays import plain
 from qsim.clip import clamped_error, exr
-from qsim.clip.manifest import FORMAT_VERSION, MEASURED, TRUTH, camera_of, check_new, check_replaced, target_of
+from qsim.clip.manifest import FORMAT_VERSION, MEASURED, OURS, TRUTH, camera_of, check_new, check_replaced, target_of
 from qsim.colour import bright_end
 from qsim.files import VERSION, check_name
 from qsim.optics import radiometry
@@ -49,13 +50,15 @@ class ClipWriter:
 
     def __enter__(self) -> ClipWriter:
         identity = files.to_json(self.meta)
+        self._refuse_foreign()
         self.part.mkdir(parents=True, exist_ok=True)
         if not self._lock.acquire():
             raise ValueError(f"{self.part}: another process is writing this clip; wait for it, or name another with -o")
         try:
+            files.check_ours(self.part, rf"{OURS}|begun\.json|journal\.jsonl|lock")
             begun = self.part / "begun.json"
             if not begun.is_file():  # before anything is deleted: an interrupted clearing stays recognisable
-                files.write_bytes(begun, self._identity_before())
+                files.write_bytes(begun, self._identity_before() or identity)
             self._complete = self._is_complete()
             if begun.read_bytes() != identity:
                 done = self._finished_meta()["shape"][0] if self._complete else len(_read_journal(self.part))
@@ -67,8 +70,7 @@ class ClipWriter:
                 self._clear()
                 self._complete = False
                 files.write_bytes(begun, identity)
-            files.remove_leftovers_below(self.part)
-            files.remove_leftovers(self.path)  # of an interrupted replacement
+            scratch.sweep(self.path.parent)
             self._frames = _read_journal(self.part)
         except BaseException:
             self._lock.release()
@@ -108,6 +110,7 @@ class ClipWriter:
         """
         if not 0 <= t < self.meta["shape"][0]:
             raise ValueError(f"{self.path}: frame {t} does not belong to a clip of {self.meta['shape'][0]} frames")
+        radiance = plain(radiance)
         contents: dict[str, bytes] = {}
         half = self._encode(t, "radiance", radiance, contents)
         lower = exr.above_half(radiance) if saturated is None else saturated | exr.above_half(radiance)
@@ -177,12 +180,25 @@ class ClipWriter:
         return {}
 
     def _identity_before(self) -> bytes:
-        """Return begun.json of a .part that lacks it: its writer was killed at the start, or during the rename."""
+        """Return begun.json of a .part whose writer was killed during the rename; empty: it was killed at the start."""
         if left := self._finished_meta():
             return files.to_json({key: value for key, value in left.items() if key not in MEASURED})
-        if all(item.name.startswith(("lock", "begun.json.tmp-")) for item in self.part.iterdir()):
-            return b""
-        raise ValueError(f"{self.part}: contains files not written by qsim; move them away, or name another with -o")
+        return b""
+
+    def _refuse_foreign(self) -> None:
+        """Raise `ValueError` unless .part is free, or what a writer of a clip of this name left there."""
+        foreign = ValueError(f"{self.part}: was not written by qsim; move it away, or name another with -o")
+        if not self.part.exists() and not self.part.is_symlink():
+            return
+        if self.part.is_symlink() or not self.part.is_dir():
+            raise foreign
+        begun = self.part / "begun.json"
+        with contextlib.suppress(ValueError):
+            known = begun.is_file() and files.read_json(begun).get("name") == self.name
+            started = all(item.name == "lock" or scratch.is_scratch(item) for item in self.part.iterdir())
+            if known or started or self._finished_meta():
+                return
+        raise foreign
 
     def _is_complete(self) -> bool:
         """Return whether the clip is complete except for the rename."""

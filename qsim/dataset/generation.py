@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from qsim import files
+from qsim import files, scratch
 from qsim.dataset.dataset import FORMAT_VERSION, Damaged, Dataset, unproven
 from qsim.dataset.job import Job
 from qsim.dataset.job_runner import (
@@ -156,7 +156,7 @@ def write_manifest(recipe: Recipe, folder: Path) -> None:
     lock = Lock(folder / "locks" / "manifest")
     lock.acquire(wait=True)
     with lock:
-        files.remove_leftovers(folder / "dataset.json")
+        scratch.sweep(folder)
         jobs, failures = {}, _failures(folder, recipe.jobs)
         for job in recipe.jobs:
             entry: dict[str, Any] = {"split": job.split, "scene": job.scene, "digest": job.digest, "state": "missing"}

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qsim import files, locks
+from qsim import files, locks, scratch
 from qsim.clip.clip import Clip
 from qsim.clip.sensing import sense
 from qsim.dataset.job import Job
@@ -171,7 +171,7 @@ def _do(job: Job, folder: Path, make: RenderJob) -> Result:
     """Make clip, streams and record; each is complete before the next begins."""
     started, worked = time.monotonic(), time.process_time()
     for path in (record_path(folder, job.name), failure_path(folder, job.name), folder / "clips" / job.name):
-        files.remove_leftovers(path)
+        scratch.sweep(path.parent)
     clip = _clip(job, folder, make)
     rendered = time.monotonic()
     for sensing in job.streams:
@@ -223,5 +223,4 @@ def _clip(job: Job, folder: Path, make: RenderJob) -> Clip:
 def _log(folder: Path, name: str, text: str) -> None:
     """Append a line with the time to the job's log."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    with open(folder / "logs" / f"{name}.log", "a", encoding="utf-8") as log:
-        log.write(f"{now} {text}\n")
+    files.append_line(folder / "logs" / f"{name}.log", f"{now} {text}".encode())

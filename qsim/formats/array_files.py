@@ -310,7 +310,7 @@ def write_zarr(folder: Path, blocks: Iterator[Array], shape: tuple[int, int, int
     """Write a zarr v3 group with `frames` [T, H, W] in chunks of full frames, as quanta-spad-sim stores them."""
     import zarr
 
-    group = zarr.open_group(str(folder), mode="a", zarr_format=3)  # "w" would delete the mark of our exports
+    group = zarr.open_group(str(folder), mode="w", zarr_format=3)
     group.attrs.update(attributes)
     per_chunk = max(1, min(max(shape[0], 1), (8 << 20) // (shape[1] * shape[2])))
     array = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files
+from qsim import files, scratch
 from qsim.clip.clip import Clip
 from qsim.clip.manifest import check_outside
 from qsim.clip.stream import Stream, orientation
@@ -49,29 +48,27 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     meta = _export_meta(source, wanted)
     path.parent.mkdir(parents=True, exist_ok=True)
     single = wanted.kind in ("cube", "mp4", "spike", "photons")
-    side, part = path.with_name(path.name + ".json"), path.with_name(path.name + ".part")
-    for place in [path, *([side] if single else [part])]:
+    side = path.with_name(path.name + ".json")
+    scratch.sweep(path.parent)
+    for place in [path, *([side] if single else [])]:
         _check_ours(place, side if single else place / "meta.json", single)
     if single:
         EXPORTS[wanted.kind](source, path, wanted, meta)
         files.write_json(side, meta)
         return path
-    if part.exists():  # of an export that was interrupted
-        files.remove_folder(part)
-    part.mkdir()
-    try:
-        files.write_json(part / "meta.json", _MARK)
+    with files.naming(path), scratch.Scratch(path) as unfinished:
+        part = unfinished.new()
+        part.mkdir()
         EXPORTS[wanted.kind](source, part, wanted, meta)
         files.write_json(part / "meta.json", meta)
-    except BaseException:
-        shutil.rmtree(part)
-        raise
-    if path.exists():  # or it appeared meanwhile
-        if not force:
-            raise FileExistsError(f"{path}: appeared while it was written; move it away and run the same command again")
-        _check_ours(path, path / "meta.json", False)
-        files.remove_folder(path)
-    part.rename(path)
+        if path.exists():  # or it appeared meanwhile
+            if not force:
+                raise FileExistsError(
+                    f"{path}: appeared while it was written; move it away and run the same command again"
+                )
+            _check_ours(path, path / "meta.json", False)
+            files.remove_folder(path)
+        part.rename(path)
     files.sync_folder(path.parent)
     return path
 
@@ -109,11 +106,9 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
     return made, f"{wanted.kind}, {frames} frames of {height} x {width} pixels at {rate:g} per second{shown}, {about}"
 
 
-_MARK = {"software": {"qsim": VERSION}}  # in every description of an export: this program wrote it
-_UNFINISHED = r"[0-9a-f]{32}\.partial"  # zarr's ending of a file that it is writing
 _NAMES = (
     r"(meta|transforms)\.json|[0-9]{6,}\.(png|exr|npy)"
-    rf"|(frames/)?zarr\.(json|{_UNFINISHED})|frames/c/[0-9]+/[0-9]+/[0-9]+(\.{_UNFINISHED})?"
+    r"|(frames/)?zarr\.json|frames/c/[0-9]+/[0-9]+/[0-9]+"
 )
 
 

@@ -13,6 +13,7 @@ from typing import Any
 from qsim.cli.completion import add_completion, sensors
 from qsim.cli.console import Parser, output, run
 from qsim.files import VERSION
+from qsim.scratch import Scratch
 from quiver.cli.domain import add_domain
 from quiver.cli.evaluate import add_bench, add_evaluate
 from quiver.cli.options import command, handling
@@ -94,10 +95,9 @@ def _run_convert_weights(args: argparse.Namespace) -> int:
         raise ValueError(f"{args.output}: weights are written as .safetensors; name a .safetensors file with -o")
     if args.force and args.output.exists():
         _check_ours(args.output)
-        fresh = args.output.with_name(f".{args.output.stem}.new.safetensors")
-        fresh.unlink(missing_ok=True)
-        network = convert_weights(args.source, fresh)
-        os.replace(fresh, args.output)
+        with Scratch(args.output) as scratch:
+            network = convert_weights(args.source, scratch.new())
+            os.replace(scratch.new(), args.output)
     else:
         network = convert_weights(args.source, args.output)
     parameters = sum(p.numel() for p in network.parameters())

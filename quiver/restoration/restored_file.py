@@ -21,6 +21,7 @@ from numpy import ndarray as Array
 
 from qsim.files import VERSION, Progress, read_json, sealed, sha256, sync_folder, write_json
 from qsim.locks import Lock
+from qsim.scratch import sweep
 from quiver.data.codes import Codes
 from quiver.device import out_of_memory
 from quiver.restoration.interface import Restorer
@@ -64,6 +65,7 @@ def restore_to_file(
     path = path.resolve()
     part, journal = _parts(path)
     with _only_writer(path):
+        sweep(path.parent)
         meta = _described(codes, method)
         if unnamed(path):
             os.replace(journal, path.with_suffix(".json"))
@@ -71,6 +73,7 @@ def restore_to_file(
             if not _done(path, path.with_suffix(".json"), meta)[2]:
                 return read_json(path.with_suffix(".json"))
         _check_target(path, journal, force)
+        _check_unfinished(part, journal)
         try:
             seconds = _fill_file(codes, method, part, journal, meta, progress, note, threads)
             meta |= {"seconds_per_frame": seconds / codes.shape[0], "threads": threads, "device": method.device}
@@ -79,7 +82,7 @@ def restore_to_file(
             write_json(journal, meta)  # takes its disk space before anything is replaced
         except BaseException as error:
             resumable = not isinstance(error, Exception) or out_of_memory(error)
-            if not (resumable and journal.exists()):
+            if not (resumable and _has_frames(journal)):
                 part.unlink(missing_ok=True)
                 journal.unlink(missing_ok=True)
             if isinstance(error, OSError) and error.errno is not None and error.filename in (None, str(part)):
@@ -140,6 +143,14 @@ def _parts(path: Path) -> tuple[Path, Path]:
     return path.with_name(path.name + ".part"), path.with_name(path.name + ".part.json")
 
 
+def _has_frames(journal: Path) -> bool:
+    """Return whether a journal records finished frames."""
+    with contextlib.suppress(OSError, ValueError):
+        found = read_json(journal)
+        return bool(found.get("done")) or "seconds_per_frame" in found
+    return False
+
+
 def _complete(journal: Path) -> bool:
     """Return whether a journal describes a complete video: its writer was killed during the renames."""
     with contextlib.suppress(FileNotFoundError, ValueError):
@@ -166,6 +177,22 @@ def _check_target(path: Path, journal: Path, force: bool) -> None:
         )
 
 
+def _check_unfinished(part: Path, journal: Path) -> None:
+    """Raise `FileExistsError` if the names of unfinished work hold anything but that: a journal, and its video."""
+    ours = not os.path.lexists(journal)
+    if not ours and journal.is_file() and not journal.is_symlink():
+        with contextlib.suppress(ValueError):
+            ours = read_json(journal).get("format") == FORMAT
+    foreign = [] if ours else [journal]
+    if os.path.lexists(part) and (part.is_symlink() or not (part.is_file() and journal.exists())):
+        foreign.append(part)
+    if foreign:
+        raise FileExistsError(
+            f"{foreign[0]}: exists and is not an unfinished restoration of this program; move it away, or name another "
+            "with -o"
+        )
+
+
 def _fill_file(
     codes: Codes,
     method: Restorer,
@@ -181,8 +208,9 @@ def _fill_file(
     done, seconds, why = _done(part, journal, meta)
     if why and note is not None:
         note(f"{part}: holds an interrupted restoration, but {why}; starting again")
-    if not done:
-        journal.unlink(missing_ok=True)
+    if not done:  # the journal first: it proves that the video is ours
+        write_json(journal, meta | {"done": 0, "seconds": 0.0})
+        part.unlink(missing_ok=True)
         _reserve(part, codes.video_shape)
     out = np.lib.format.open_memmap(part, mode="r+")
     for first in range(done, length, BLOCK_FRAMES if method.seamless else length):
@@ -208,7 +236,7 @@ def _at_a_time(codes: Codes) -> tuple[int, int]:
 
 def _reserve(part: Path, shape: tuple[int, ...]) -> None:
     """Create a .npy of float32 of this shape and reserve its disk space. `OSError` if there is not enough."""
-    with open(part, "wb") as file:
+    with open(part, "xb") as file:
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype(np.float32)), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
         file.flush()

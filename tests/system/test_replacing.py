@@ -110,7 +110,7 @@ def test_an_export_replaces_only_an_export(tmp_path: Path, kind: str):
     clip = write_clip(tmp_path / "clip", frames=2, height=6, width=8)
     source = sense(clip, Sensing("spad-320x240", bits=1, ppp=1.0))[0] if kind == "cube" else clip
     target = tmp_path / "out"
-    for place in (target, target.with_name("out.part"), target.with_name("out.json")):
+    for place in (target, target.with_name("out.json")):
         if place.name.endswith("json") or (kind in ("mp4", "cube") and place == target):
             if kind not in ("mp4", "cube"):
                 continue
@@ -140,17 +140,6 @@ def test_an_export_replaces_only_an_export(tmp_path: Path, kind: str):
         exporting.export(source, target, Export(kind), force=force)
     with pytest.raises(FileExistsError, match="use --force"):
         exporting.export(source, target, Export(kind))
-
-
-def test_an_interrupted_export_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    clip = write_clip(tmp_path / "clip", frames=2, height=6, width=8)
-    part = tmp_path / "out.part"
-    part.mkdir()
-    files.write_json(part / "meta.json", {"software": {"qsim": "0.1.0"}})
-    (part / "000000.png").write_bytes(b"half")
-    exporting.export(clip, tmp_path / "out", Export("png"))
-    assert not part.exists()
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["000000.png", "000001.png", "meta.json"]
 
 
 @pytest.mark.parametrize("stranger", ["notes.txt", "radiance/notes.txt", "streams/a.toml", "radiance/000000.exr.bak"])

@@ -177,7 +177,7 @@ def test_files_and_other_folders_are_never_replaced(tmp_path: Path):
     for name in ("thesis", "b"):
         with pytest.raises(FileExistsError, match="exists and is not a clip"):
             ClipWriter(tmp_path / name, meta(), force=True)
-    with pytest.raises(ValueError, match=r"c\.part: contains files not written by qsim"):
+    with pytest.raises(ValueError, match=r"c\.part: was not written by qsim"):
         ClipWriter(tmp_path / "c", meta()).__enter__()
     left = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and path.name != "lock"}
     assert left == before
