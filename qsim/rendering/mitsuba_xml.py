@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -29,6 +30,9 @@ from qsim.scene.flicker import Flicker
 
 F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera made from the file's sensor, which has no pixels in metres
 MOVABLE = ("to_world", POSITIONS)
+REJECTIONS = (  # what Mitsuba raises for files that it cannot load
+    *(RuntimeError, ValueError, TypeError, LookupError, AttributeError, UnicodeError, RecursionError, OSError),
+)
 EMISSION = (  # what scales a light: lamp or glow, even, point or spot, parallel, image
     *("emitter.radiance.value", "radiance.value", "intensity.value", "irradiance.value", "scale"),
 )
@@ -137,10 +141,11 @@ def load(mi: Any, path: str) -> Any:
     """Return Mitsuba's scene object with an id for every shape; unnamed shapes are numbered."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file")
+    _refuse_hidden_lights(Path(path))
     try:
         with errors_only(mi):  # it warns that a colour film becomes grey; no film is used
             loaded = mi.load_file(path, optimize=False)  # optimising would merge shapes and lose their names
-    except RuntimeError as error:
+    except REJECTIONS as error:
         needs = _cure(mi) if "RGB" in str(error) else ""
         raise ValueError(f"{path}: Mitsuba cannot load it: {_reason(error)}{needs}") from None
     if not isinstance(loaded, mi.Scene):
@@ -149,6 +154,32 @@ def load(mi: Any, path: str) -> Any:
         if not shape.id():
             shape.set_id(f"shape {i}")
     return loaded
+
+
+def _refuse_hidden_lights(path: Path) -> None:
+    """Raise `ValueError` for an integrator that hides light sources: it changes the picture, and does not count."""
+    try:
+        flags = ElementTree.parse(path).iter("boolean")
+        hidden = any(e.get("name") == "hide_emitters" and e.get("value", "").lower() == "true" for e in flags)
+    except (ElementTree.ParseError, OSError, ValueError, RecursionError):
+        return  # Mitsuba reports the error
+    if hidden:
+        raise ValueError(f"{path}: hide_emitters is true, and light sources are seen here; leave it out")
+
+
+def _check_film(sensor: Any, path: Path, ask: str) -> None:
+    """Raise `ValueError` for a film or a sensor whose response is not taken over; warn of a filter that is left out."""
+    film = sensor.film()
+    if film.class_name() != "HDRFilm":
+        raise ValueError(f"{path}: its film is a {film.class_name()}, only 'hdrfilm' is taken over; {ask}")
+    if sensor.needs_aperture_sample() or sensor.get_medium() is not None:
+        raise ValueError(f"{path}: its sensor has an aperture or lies in a medium, which is not taken over; {ask}")
+    filter_name = str(film.rfilter()).split("[")[0].strip()
+    if not filter_name.startswith(("Box", "Gaussian")):
+        warnings.warn(
+            f"{path}: the film's rfilter {filter_name} is left out: a pixel collects the light of its own area",
+            stacklevel=4,
+        )
 
 
 def _camera(mi: Any, loaded: Any, path: Path) -> Camera:
@@ -164,6 +195,9 @@ def _camera(mi: Any, loaded: Any, path: Path) -> Camera:
 
     if sensor.class_name() != "PerspectiveCamera":
         raise ValueError(f"{path}: its sensor is a {sensor.class_name()}, only 'perspective' is taken over; {ask}")
+    _check_film(sensor, path, ask)
+    if any("srf" in key for key in values.keys()):  # noqa: SIM118 (no mapping)
+        raise ValueError(f"{path}: its sensor has a spectral response (srf), which is not taken over; {ask}")
     pose = np.array(values["to_world"].matrix, np.float64).reshape(4, 4)
     _, up, forward = pose[:3, :3].T  # Mitsuba's camera axes: left, up, forward
     if np.linalg.det(pose[:3, :3]) <= 0:

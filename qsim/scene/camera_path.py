@@ -95,7 +95,8 @@ def read_camera_path(
     if rate is None:
         raise ValueError(f"{where}: states no frame_rate; give the poses per second, as in frame_rate=30")
     poses = [_pose(frame, scale) for frame in frames]
-    found = content | _common(frames, where)
+    found = content | _common(frames)
+    _check_lens(content, frames, found, where)
     if size is not None and not all(found.get(key) for key in ("w", "h")):
         pixels = [key for key in ("fl_x", "fl_y", "cx", "cy") if found.get(key) is not None]
         if pixels:
@@ -194,36 +195,26 @@ def _pose(frame: dict[str, Any], scale: float) -> Array:
     return UPRIGHT @ matrix @ FLIP
 
 
-def _common(frames: list[dict[str, Any]], where: str) -> dict[str, Any]:
-    """Return the lens that every frame states alike; `ValueError` if they differ."""
-    found: dict[str, Any] = {}
-    for key in _KEYS:
-        values = [frame[key] for frame in frames if frame.get(key) is not None]
-        if values and (len(values) < len(frames) or any(value != values[0] for value in values)):
-            raise ValueError(f"{where}: frames differ in {key}; a path has one lens, so split the file by cameras")
-        if values:
-            found[key] = values[0]
-    return found
+def _common(frames: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what every frame states alike of its lens."""
+    return {key: frames[0][key] for key in _KEYS if frames[0].get(key) is not None and not _differs(frames, key)}
+
+
+def _differs(frames: list[dict[str, Any]], key: str) -> bool:
+    """Return whether some frames state another value of a key, or none, where others state one."""
+    values = [frame.get(key) for frame in frames]
+    return any(value != values[0] for value in values)
 
 
 def _seen_from(found: dict[str, Any], where: str, like: Camera, pose: Array, sized: bool) -> Camera:
     """Return `like` at a pose [4, 4], with the size, view and lens that a file states."""
     stated = {key: found[key] for key in _KEYS if found.get(key) is not None}
-    _check_lens(stated, where)
     if not sized and not {"w", "h"} <= stated.keys():
         raise ValueError(f"{where}: states no w and h; give a camera of the size of its pictures, like=Camera(...)")
     height, width = int(stated.get("h", like.height)), int(stated.get("w", like.width))
     if "fl_x" not in stated and "camera_angle_x" not in stated:
         raise ValueError(f"{where}: states neither fl_x nor camera_angle_x; one of them gives the view")
     focal = stated.get("fl_x") or width / 2 / math.tan(stated["camera_angle_x"] / 2)
-    other, allowed = stated.get("fl_y", focal), SQUARE
-    if "fl_y" not in stated and {"w", "h", "camera_angle_y"} <= stated.keys():  # without a size, `like` has another
-        other, allowed = height / 2 / math.tan(stated["camera_angle_y"] / 2), SQUARE_BY_ANGLE
-    if abs(other / focal - 1) > allowed:
-        raise ValueError(
-            f"{where}: its focal length is {focal:g} px along x and {other:g} px along y: pixels are square here; "
-            "calibrate with one focal length (COLMAP's model RADIAL), or resample the pictures"
-        )
     shift = ((stated.get("cx", width / 2) - width / 2) / height, (stated.get("cy", height / 2) - height / 2) / height)
     bent = Lens(stated.get("k1", 0.0), stated.get("k2", 0.0), () if like.lens is None else like.lens.falloff, shift)
     distance, ahead = focal * like.pixel_pitch, like.focus
@@ -244,15 +235,39 @@ def _seen_from(found: dict[str, Any], where: str, like: Camera, pose: Array, siz
         raise ValueError(f"{where}: {error}") from None
 
 
-def _check_lens(stated: dict[str, Any], where: str) -> None:
-    """Raise `ValueError` for a lens that is not modelled."""
+def _check_lens(content: dict[str, Any], frames: list[dict[str, Any]], found: dict[str, Any], where: str) -> None:
+    """Raise one `ValueError` that names everything of a file that no camera here can follow, and what to do."""
+    stated = {key: found[key] for key in _KEYS if found.get(key) is not None}
+    blocking = []
     model = stated.get("camera_model", "OPENCV")
-    if model not in MODELS or stated.get("is_fisheye"):
-        found = f"camera_model is {model!r:.40}" if model not in MODELS else "is_fisheye is true"
-        raise ValueError(f"{where}: {found}; only perspective lenses are read: {', '.join(MODELS)}")
-    wrong = [key for key in ZERO if stated.get(key, 0) != 0]
-    if wrong:
-        raise ValueError(
-            f"{where}: {wrong[0]} is {stated[wrong[0]]:g}; only k1 and k2 are modelled here: calibrate without "
-            f"{', '.join(wrong)} (COLMAP's model RADIAL), or undistort the pictures"
-        )
+    if model not in MODELS:
+        blocking.append(f"camera_model is {model!r:.40} (read are {', '.join(MODELS)})")
+    if stated.get("is_fisheye"):
+        blocking.append("is_fisheye is true (only perspective lenses are read)")
+    blocking += [f"{key} is {stated[key]:g} (k1 and k2 are modelled)" for key in ZERO if stated.get(key, 0) != 0]
+    blocking += _not_square(stated)
+    differing = [key for key in _KEYS if _differs(frames, key)]
+    if differing:
+        blocking.append(f"frames differ in {', '.join(differing)} (a path has one lens)")
+    if blocking:
+        cures = {
+            "frames differ": "split the file by cameras, or calibrate with one shared camera",
+            "": "calibrate with COLMAP's model RADIAL, or undistort the pictures (COLMAP's image_undistorter)",
+        }
+        cure = cures["frames differ" if len(blocking) == bool(differing) else ""]
+        raise ValueError(f"{where}: {'; '.join(blocking)}: {cure}")
+
+
+def _not_square(stated: dict[str, Any]) -> list[str]:
+    """Return a line on focal lengths that differ along x and y; pixels are square here."""
+    if {"fl_x", "fl_y"} <= stated.keys():
+        along, down, allowed = stated["fl_x"], stated["fl_y"], SQUARE
+    elif {"w", "h", "camera_angle_y"} <= stated.keys() and {"fl_x", "camera_angle_x"} & stated.keys():
+        along = stated.get("fl_x") or stated["w"] / 2 / math.tan(stated["camera_angle_x"] / 2)
+        down = stated["h"] / 2 / math.tan(stated["camera_angle_y"] / 2)
+        allowed = SQUARE_BY_ANGLE
+    else:
+        return []
+    if abs(down / along - 1) <= allowed:
+        return []
+    return [f"the focal length is {along:g} px along x and {down:g} px along y (pixels are square here)"]

@@ -100,3 +100,24 @@ def test_the_size_is_the_films_and_another_shape_is_reported(tmp_path):
         assert [str(each.message) for each in said if "the horizontal one is" in str(each.message)] == (
             [] if expected != (20, 20) else [str(said[0].message)]
         )
+
+
+def test_settings_that_change_the_picture_are_refused_by_name(tmp_path):
+    hidden = '<integrator type="path"><boolean name="hide_emitters" value="true"/></integrator>'
+    path = write(tmp_path)
+    plain = path.read_text()
+    for old, new, said in (
+        ('<integrator type="path"/>', hidden, "hide_emitters is true"),
+        (
+            'type="perspective">',
+            'type="thinlens"><float name="aperture_radius" value="0.1"/>',
+            "its sensor is a ThinLensCamera",
+        ),
+        ('type="hdrfilm"', 'type="specfilm"', "Mitsuba cannot load it|its film is a"),
+    ):
+        path.write_text(plain.replace(old, new))
+        with pytest.raises(ValueError, match=said):
+            read_mitsuba(path)
+    path.write_text(plain.replace('rfilter type="box"', 'rfilter type="lanczos"'))
+    with pytest.warns(UserWarning, match="rfilter .* is left out"):
+        read_mitsuba(path)
