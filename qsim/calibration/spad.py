@@ -354,9 +354,13 @@ def _efficiency(array: _Array) -> tuple[dict[str, Value], list[str]]:
     if array.ratio is not None:
         ends = [slopes(replace(array.response, ratio=ratio)) for ratio in array.ratio.ends]
         moved = (ends[1] - ends[0]) / (2 * Z95)
-    weights = np.linalg.solve(covariance + np.outer(moved, moved), np.ones(len(used)))
+    errors = covariance + np.outer(moved, moved)
+    weights = np.linalg.solve(errors, np.ones(len(used)))
     weights /= weights.sum()
     value = float(weights @ base)
+    if len(used) > 1:  # flats that scatter by more than their noise: the lamp was not steady
+        scatter = float((base - value) @ np.linalg.solve(errors, base - value)) / (len(used) - 1)
+        covariance = covariance * max(scatter, 1.0)
     down, up = array.reach(lambda response: np.array([weights @ slopes(response)]), np.array([value]))
     square = Z95**2 * float(weights @ covariance @ weights)
     low, high = value - sqrt(square + float(down[0])), value + sqrt(square + float(up[0]))
