@@ -143,6 +143,18 @@ def wording(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
+def native(path: Path | str) -> str:
+    """Return a path for libraries in C and C++, which take UTF-8.
+
+    In a locale without it (LC_ALL=C) Python keeps such names as surrogates, which these libraries refuse by TypeError.
+    `ValueError` if the name is not UTF-8 in any case.
+    """
+    try:
+        return os.fsencode(path).decode("utf-8")
+    except UnicodeDecodeError:
+        raise ValueError(f"{str(path)!a}: the name is not UTF-8, so no library reads it; rename it") from None
+
+
 def write_bytes(path: Path, content: bytes | memoryview) -> str:
     """Write a file atomically; return its SHA-256."""
     with replacing(path) as file:

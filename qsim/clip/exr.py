@@ -20,7 +20,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
-from qsim.files import decoding_errors
+from qsim.files import decoding_errors, native
 from qsim.optics.radiometry import Crop
 
 MAGIC = bytes((0x76, 0x2F, 0x31, 0x01)) + struct.pack("<i", 2)
@@ -102,7 +102,7 @@ def read(path: Path, size: tuple[int, int] | None = None) -> dict[str, Array]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; the clip is damaged, run `qsim check`")
     with decoding_errors(path, "OpenEXR; the file is damaged, run `qsim check`"):
-        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+        with OpenEXR.File(native(path), separate_channels=True, header_only=True) as file:
             header = dict(file.header())  # a copy: closing empties it
             names = [channel.name for channel in header["channels"]]
         first, last = (np.asarray(corner) for corner in header["dataWindow"])
@@ -112,7 +112,7 @@ def read(path: Path, size: tuple[int, int] | None = None) -> dict[str, Array]:
             raise ValueError(f"{path}: holds {header['type']} {found}, expected scan lines {[height, width]}")
         if 2 * height * width * len(names) > 1032 * path.stat().st_size:  # the most that deflate can shrink
             raise ValueError(f"{path}: {path.stat().st_size} bytes cannot hold {len(names)} channels of {found}")
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with OpenEXR.File(native(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
         for name, array in channels.items():
             if array.shape != (height, width):

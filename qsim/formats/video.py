@@ -167,7 +167,7 @@ def _open_video(path: Path) -> Any:
     """Open a container; files that name other files (playlists) and frames above MAX_PIXELS are refused."""
     import av
 
-    container = av.open(str(path), options={"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"})
+    container = av.open(files.native(path), options={"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"})
     for stream in container.streams.video:
         stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
     return container

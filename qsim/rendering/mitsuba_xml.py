@@ -144,7 +144,8 @@ def load(mi: Any, path: str) -> Any:
     _refuse_hidden_lights(Path(path))
     try:
         with errors_only(mi):  # it warns that a colour film becomes grey; no film is used
-            loaded = mi.load_file(path, optimize=False)  # optimising would merge shapes and lose their names
+            # Optimising would merge shapes and lose their names.
+            loaded = mi.load_file(files.native(path), optimize=False)
     except REJECTIONS as error:
         needs = _cure(mi) if "RGB" in str(error) else ""
         raise ValueError(f"{path}: Mitsuba cannot load it: {_reason(error)}{needs}") from None

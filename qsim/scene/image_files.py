@@ -10,6 +10,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.colour import luminance, to_linear
+from qsim.files import native
 
 
 def read_grey(path: Path) -> np.ndarray:
@@ -55,7 +56,7 @@ def read_hdr(path: Path) -> Array:
     import OpenEXR
 
     try:
-        parts = [part.channels for part in OpenEXR.File(str(path)).parts]
+        parts = [part.channels for part in OpenEXR.File(native(path)).parts]
     except Exception as error:  # the binding raises several types for a bad file
         raise ValueError(f"environment {path}: not a readable OpenEXR file ({error})") from error
     pictures = [part[name] for part in parts for name in ("RGB", "RGBA", "Y") if name in part]
