@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import llvm
-from qsim.files import write_bytes
+from qsim.files import wording, write_bytes
 
 BACKENDS = ("cuda", "llvm", "scalar")
 VARIANTS = {"cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono", "scalar": "scalar_rgb"}
@@ -115,7 +115,7 @@ def report() -> dict[str, Any]:
     cuda, stored = probe_cuda(), _cached_probes()
     probes = [asdict(probe) for probe in (stored if cuda in stored else [cuda, *stored])]  # one that passes is not kept
     software = {"mitsuba": version("mitsuba"), "drjit": version("drjit")}
-    return asdict(engine) | {"probes": probes, "software": software, "cache": str(_cache_file())}
+    return asdict(engine) | {"probes": probes, "software": software, "cache": str(_cache_file() or "none (no home)")}
 
 
 def decide(wanted: str | None) -> RenderEngine:
@@ -203,14 +203,16 @@ def run_probe(variant: str, library: str | None) -> Probe:
     return Probe(backend, library, False, (ended + last)[:300])
 
 
-def _cache_file() -> Path:
-    root = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or str(Path.home() / ".cache")
-    return Path(root) / "qsim" / "engine.json"
+def _cache_file() -> Path | None:
+    """Return the file of stored results; None for a user without a home, as in containers."""
+    root = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or os.path.expanduser("~/.cache")
+    return Path(root) / "qsim" / "engine.json" if os.path.isabs(root) else None
 
 
 def _read_cache() -> dict[str, dict[str, Any]]:
+    file = _cache_file()
     try:
-        answers = json.loads(_cache_file().read_text())
+        answers = json.loads(file.read_text()) if file else {}
     except (OSError, ValueError):
         return {}
     return answers if isinstance(answers, dict) else {}
@@ -218,11 +220,14 @@ def _read_cache() -> dict[str, dict[str, Any]]:
 
 def _write_cache(answers: dict[str, dict[str, Any]]) -> None:
     """Store the results if possible; without a writable home every process tests again."""
+    file = _cache_file()
     try:
-        _cache_file().parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(_cache_file(), json.dumps(answers, indent=1).encode())
+        if file is None:
+            raise FileNotFoundError("this user has no home; set XDG_CACHE_HOME to a folder")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(file, json.dumps(answers, indent=1).encode())
     except OSError as error:
-        warnings.warn(f"{_cache_file()}: cannot store the choice of the engine ({error})", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"cannot store the choice of the engine ({wording(error)})", RuntimeWarning, stacklevel=2)
 
 
 def _cached_probes() -> list[Probe]:

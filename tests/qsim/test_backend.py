@@ -202,3 +202,13 @@ def test_a_broken_cache_file_is_ignored(tmp_path, monkeypatch):
     (tmp_path / "qsim" / "backend.json").write_text("{half a file")
     monkeypatch.setattr(backend, "run_probe", lambda variant, path: backend.Probe("llvm", path, True, "LLVM 19"))
     assert backend.cached_probe("llvm_ad_mono", sys.executable).works
+
+
+def test_a_user_without_a_home_tests_in_every_process(monkeypatch):
+    """Containers run as a number that no list of users has; `Path.home` raised a RuntimeError there."""
+    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 4_000_000_000)
+    monkeypatch.setattr(backend, "run_probe", lambda variant, path: backend.Probe("llvm", path, True, "LLVM 19"))
+    with pytest.warns(RuntimeWarning, match="this user has no home; set XDG_CACHE_HOME"):
+        assert backend.cached_probe("llvm_ad_mono", sys.executable).works
