@@ -25,13 +25,18 @@ class Tolerant:
         """Write a text; characters that the encoding of the stream lacks are written as escapes."""
         if self._stream is not None:
             try:
-                self._stream.write(text)
-            except UnicodeEncodeError:
-                encoding = self._stream.encoding or "ascii"
-                self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+                self._write(self._stream, text)
             except (OSError, ValueError) as error:  # ValueError: the stream is closed
                 self._drop(error)
         return len(text)
+
+    @staticmethod
+    def _write(stream: TextIO, text: str) -> None:
+        try:
+            stream.write(text)
+        except UnicodeEncodeError:
+            encoding = stream.encoding or "ascii"
+            stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
 
     def flush(self) -> None:
         """Write what is kept in memory."""
