@@ -206,7 +206,11 @@ def _restored(source: Path) -> dict[str, Any]:
 def _size(made: Clip | Stream) -> str:
     frames, height, width = made.shape
     rate, exposure = float(made.meta["frame_rate"]), made.exposure
-    return f"{frames} frames of {height} x {width} pixels at {rate:g} per second, exposure {exposure * 1e6:.4g} us"
+    said = f"{frames} frames of {height} x {width} pixels at {rate:g} per second, exposure {exposure * 1e6:.4g} us"
+    times = made.meta.get("times")
+    if times is None:
+        return said
+    return f"{said}, times {times['values'][0]:.10g} to {times['values'][-1]:.10g} {times['unit']} ({times['source']})"
 
 
 def _flat_name(file: Path, folder: Path) -> str:

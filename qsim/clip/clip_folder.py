@@ -97,6 +97,15 @@ class ClipFolder:
         return float(self.meta["exposure"])
 
     @property
+    def times(self) -> Array | None:
+        """When each frame was taken, as the source of an imported clip states it, float64 [T]; None if it does not.
+
+        `meta["times"]` also holds the unit and the source. Frames are at even times elsewhere.
+        """
+        found = self.meta.get("times")
+        return None if found is None else np.array(found["values"], np.float64)
+
+    @property
     def origin(self) -> tuple[int, int]:
         """(y, x) of the first pixel in the camera's frame: not (0, 0) if only a crop was rendered."""
         y, x = self.meta.get("origin") or (0, 0)

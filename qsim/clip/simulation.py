@@ -162,7 +162,10 @@ class Draw:
         """Yield all codes of a stream, packed row by row, some frames at a time: uint8 [t, H, ceil(W bits / 8)]."""
         step = max(1, _BLOCK_PIXELS // (clip.shape[1] * clip.shape[2] * self.planes))
         apart = self.remembers or self.shares is not None
-        if self.followed is not None or self.defects is not None or self.planes > 1 or apart:
+        if self.followed is not None:
+            yield packing.pack(self._follow(clip, frames, progress), self.sensor.bits)
+            return
+        if self.defects is not None or self.planes > 1 or apart:
             blocks: Iterator[Array] = (
                 packing.pack(block, self.sensor.bits) for block in self.blocks(clip, 0, frames, step)
             )
@@ -257,13 +260,23 @@ class Draw:
             array, self._slices(clip), shape, self._exposure(clip), self.planes / clip.frame_rate
         )
 
-    def _follow(self, clip: ClipFolder, frames: int) -> Array:
-        """Return codes [frames, H, W] of counting pixels, followed photon by photon from the first frame."""
+    def _follow(self, clip: ClipFolder, frames: int, progress: Progress | None = None) -> Array:
+        """Return codes [frames, H, W] of counting pixels, followed photon by photon from the first frame.
+
+        `progress(done, frames)` is called after each row of pixels: all their frames are drawn together.
+        """
         array = self._array(clip)
         assert array is not None
         shape = (frames, *clip.shape[1:])
         exposure, frame_time = self._exposure(clip), self.planes / clip.frame_rate
-        return event_simulation.follow(array, self._slices(clip), shape, exposure, frame_time, self.key, self.origin)
+
+        def rows_done(done: int, rows: int) -> None:
+            if progress is not None:
+                progress(frames * done // rows, frames)
+
+        return event_simulation.follow(
+            array, self._slices(clip), shape, exposure, frame_time, self.key, self.origin, rows_done
+        )
 
     def trace(self, clip: ClipFolder, frames: int) -> Iterator[tuple[Array, Array]]:
         """Yield the times [n] in s and kinds [n] of the events behind the first codes of each pixel, row by row.

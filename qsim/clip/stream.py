@@ -63,6 +63,12 @@ class Stream:
     def __len__(self) -> int:
         return int(self.meta["shape"][0])
 
+    @property
+    def times(self) -> Array | None:
+        """When each code was taken, as the source of an imported stream states it, float64 [T]; else None."""
+        found = self.meta.get("times")
+        return None if found is None else np.array(found["values"], np.float64)
+
     def __repr__(self) -> str:
         frames, height, width = self.shape
         ppp = self.meta.get("ppp")

@@ -105,8 +105,16 @@ def light_line(clip: Clip) -> str:
     photons = "" if clip.camera is None else f", {clip.mean_photons:.4g} photons per pixel and exposure"
     return (
         f"{frames} frames of {height} × {width} at {clip.frame_rate:g} fps, exposure {clip.exposure * 1e6:.4g} µs, "
-        f"mean radiance {clip.mean_radiance:.4g} {unit}{photons}{in_bands(clip)}"
+        f"mean radiance {clip.mean_radiance:.4g} {unit}{photons}{in_bands(clip)}{_stated_times(clip)}"
     )
+
+
+def _stated_times(clip: Clip) -> str:
+    """Return the first and last time that the source of an imported clip states, or an empty text."""
+    if clip.times is None:
+        return ""
+    about = clip.meta["times"]
+    return f", taken from {clip.times[0]:.10g} to {clip.times[-1]:.10g} {about['unit']} by the {about['source']}"
 
 
 def flicker_line(clip: Clip) -> str:

@@ -273,16 +273,23 @@ def follow(
     frame_time: float,
     key: Key,
     origin: tuple[int, int] = (0, 0),
+    progress: Callable[[int, int], None] | None = None,
 ) -> Array:
     """Return codes of a clip of `shape` (T, H, W), each pixel followed photon by photon from the first frame.
 
     Crosstalk is drawn after that, between the pixels of each frame. `origin` (y, x) places a crop in the full frame.
+    `progress(rows done, rows)` is called after each row.
     """
     codes = np.empty(shape, array.sensor.dtype)
     memory = memory_of(array.defects)
-    for y, sensor, photons in _strips(array, light, shape, exposure):
-        rows = slice(y, y + photons.shape[2])
-        codes[:, rows] = _follow_pixels(sensor, photons, exposure, frame_time, memory, key, (origin[0] + y, origin[1]))
+    for first, sensor, photons in _strips(array, light, shape, exposure):
+        for i in range(photons.shape[2]):
+            y = first + i
+            place = (origin[0] + y, origin[1])
+            row = photons[:, :, i : i + 1]
+            codes[:, y : y + 1] = _follow_pixels(sensor, row, exposure, frame_time, memory, key, place)
+            if progress is not None:
+                progress(y + 1, shape[1])
     if array.maps.dead is not None:
         codes[:, array.maps.dead] = 0
     noise = CorrelatedNoise(crosstalk=array.defects.crosstalk)

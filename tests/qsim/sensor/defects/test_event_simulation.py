@@ -293,3 +293,19 @@ def test_events_of_pixels_with_crosstalk_are_refused():
     events = trace(array, lambda t, y, rows: np.ones((1, rows, 3)), (1, 2, 3), EXPOSURE, EXPOSURE, KEY)
     with pytest.raises(ValueError, match="crosstalk: its detections have no times; leave it out"):
         next(events)
+
+
+def test_following_photons_tells_each_row():
+    """87 s passed without a word; codes do not depend on rows being drawn one by one."""
+    sensor = CountingSPAD(pde=0.5, dark_count_rate=100.0, dead_time=1e-5, bits=8)
+    array = PixelArray.of(Defects(), sensor, 5, 4)
+    light = np.random.default_rng(0).uniform(0, 20, (3, 1, 5, 4))
+    told: list[tuple[int, int]] = []
+    whole = follow(array, lambda t, y, n: light[t, :, y : y + n], (3, 5, 4), 1e-3, 2e-3, Key(seed=1, clip=2),
+                   progress=lambda *done: told.append(done))  # fmt: skip
+    assert told == [(y, 5) for y in range(1, 6)]
+    rest = PixelArray.of(Defects(), sensor, 3, 4, (2, 0))
+    below = follow(
+        rest, lambda t, y, n: light[t, :, 2 + y : 2 + y + n], (3, 3, 4), 1e-3, 2e-3, Key(seed=1, clip=2), (2, 0)
+    )
+    np.testing.assert_array_equal(whole[:, 2:], below)
