@@ -258,8 +258,9 @@ def _mean_rate(array: _Array, dark: DarkRates, chosen: Array) -> Value:
     pixel_time = dark.time * chosen.sum()
     if not any(stack.total[chosen].any() for stack in array.darks):
         return Value(0.0, 0.0, NO_EVENT_BOUND / pixel_time, "1/s", "no dark count: upper bound")
-    if 0 < count < FEW_COUNTS and not dark.saturated.any():
-        return poisson_interval(max(rate, 0.0), count, "1/s", what)
+    exact = poisson_interval(max(rate, 0.0), count, "1/s", what) if 0 < count < FEW_COUNTS else None
+    if exact is not None and not array.hot.any():
+        return exact
     near = chosen & (dark.missing < NEARLY_SATURATED) & array.hot
     far = chosen & ~near
     mean = max(stack.mean for stack in array.darks)
@@ -271,8 +272,13 @@ def _mean_rate(array: _Array, dark: DarkRates, chosen: Array) -> Value:
         return np.array([float(dark_rates(array.darks, response).rate[chosen].mean())])
 
     down, up = array.reach(quantity, np.array([rate]))
-    low = rate - sqrt((Z95**2 * square + below) / n**2 + float(down[0]))
-    high = rate + sqrt((Z95**2 * square + above) / n**2 + float(up[0]))
+    below += Z95**2 * square
+    above += Z95**2 * square
+    if exact is not None:  # crosstalk of hot pixels is subtracted, which widens it
+        below = max(below, ((exact.value - exact.low) * n) ** 2)
+        above = max(above, ((exact.high - exact.value) * n) ** 2)
+    low = rate - sqrt(below / n**2 + float(down[0]))
+    high = rate + sqrt(above / n**2 + float(up[0]))
     if (dark.saturated & chosen).any():
         what = f"{what}; {(dark.saturated & chosen).sum()} pixels are saturated: a lower limit"
     return Value(max(rate, 0.0), max(low, 0.0), max(high, 0.0), "1/s", what)
