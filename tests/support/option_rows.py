@@ -1,6 +1,7 @@
 """One row for every option of every command: the option changes a result, or it is refused.
 
-A row runs a command twice in copies of one small work folder, without and with the option, and compares what was made.
+A row runs a command in a copy of one small work folder, without and with the option, and compares what was made. Rows
+of one command share the run without the option.
 Results are compared: pixels, codes, weights, numbers. A change of a description alone is not an effect.
 """
 
@@ -12,6 +13,7 @@ import json
 import re
 import shlex
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -182,38 +184,64 @@ def _only_a_note() -> Iterator[None]:
         yield
 
 
+def prepared(row: Row, main: Main, work: Path, folder: Path, capsys: Any, monkeypatch: Any) -> Path:
+    """A copy of the work folder in which the row's command can run."""
+    shutil.copytree(work, folder, symlinks=True)
+    if callable(row.before):
+        monkeypatch.chdir(folder)
+        row.before(folder)
+    elif row.before:
+        first = execute(main, row.before, folder, capsys, monkeypatch)
+        assert first.code == 0, f"{row.before}: {first.err}"
+    return folder
+
+
+_WITHOUT: dict[tuple[Any, ...], Run] = {}
+
+
+def without(row: Acts, main: Main, work: Path, capsys: Any, monkeypatch: Any) -> Run:
+    """The run without the option: once for all rows of one command, whose results are read from its folder."""
+    key = (main, work, row.command, row.before, row.after)
+    if key not in _WITHOUT:
+        folder = Path(tempfile.mkdtemp(prefix="without", dir=work.parent)) / "work"
+        prepared(row, main, work, folder, capsys, monkeypatch)
+        _WITHOUT[key] = finished(row, row.command, main, folder, capsys, monkeypatch)
+    return _WITHOUT[key]
+
+
+def finished(row: Acts, line: str, main: Main, folder: Path, capsys: Any, monkeypatch: Any) -> Run:
+    """A run of a command line, and of what comes after it."""
+    run = execute(main, line, folder, capsys, monkeypatch)
+    assert run.code in row.codes, run.err
+    if row.after:
+        last = execute(main, row.after, folder, capsys, monkeypatch)
+        assert last.code == 0, f"{row.after}: {last.err}"
+    return run
+
+
+def _check_refusal(row: Refused, run: Run) -> None:
+    """One sentence, exit code 2."""
+    lines = [line for line in run.err.splitlines() if re.match(r"(qsim|quiver)( [a-z-]+)?: ", line)]
+    assert run.code == 2, f"accepted: {run.out}{run.err}"
+    assert row.says in run.err, run.err
+    assert len(lines) <= 1, run.err
+    assert "Traceback" not in run.err, run.err
+
+
 def check(row: Row, main: Main, work: Path, tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
     """Assert what a row says."""
-    folders = []
-    for name in ("without", "with"):
-        folder = tmp_path / name / "work"
-        shutil.copytree(work, folder, symlinks=True)
-        if callable(row.before):
-            monkeypatch.chdir(folder)
-            row.before(folder)
-        elif row.before:
-            first = execute(main, row.before, folder, capsys, monkeypatch)
-            assert first.code == 0, f"{row.before}: {first.err}"
-        folders.append(folder)
+    line = f"{row.command} {row.option}"
     if isinstance(row, Refused):
-        before = _state(folders[1])
-        run = execute(main, f"{row.command} {row.option}", folders[1], capsys, monkeypatch)
-        lines = [line for line in run.err.splitlines() if re.match(r"(qsim|quiver)( [a-z-]+)?: ", line)]
-        assert run.code == 2, f"accepted: {run.out}{run.err}"
-        assert row.says in run.err, run.err
-        assert len(lines) <= 1, run.err
-        assert "Traceback" not in run.err, run.err
-        assert _state(folders[1]) == before, "something was changed or left behind"
+        folder = prepared(row, main, work, tmp_path / "work", capsys, monkeypatch)
+        before = _state(folder)
+        _check_refusal(row, execute(main, line, folder, capsys, monkeypatch))
+        assert _state(folder) == before, "something was changed or left behind"
         return
-    found = []
-    for folder, line in zip(folders, (row.command, f"{row.command} {row.option}"), strict=True):
-        run = execute(main, line, folder, capsys, monkeypatch)
-        assert run.code in row.codes, run.err
-        if row.after:
-            last = execute(main, row.after, folder, capsys, monkeypatch)
-            assert last.code == 0, f"{row.after}: {last.err}"
-        found.append(row.result(run))
-    assert found[0] != found[1], "the option changes nothing"
+    plain = without(row, main, work, capsys, monkeypatch)
+    assert plain.code in row.codes, plain.err
+    folder = prepared(row, main, work, tmp_path / "work", capsys, monkeypatch)
+    changed = finished(row, line, main, folder, capsys, monkeypatch)
+    assert row.result(plain) != row.result(changed), "the option changes nothing"
 
 
 def _state(folder: Path) -> dict[str, bytes]:

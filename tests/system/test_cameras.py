@@ -127,7 +127,9 @@ def departure(clip: Clip, stream: Stream, how: dict[str, Any]) -> float:
     return float(np.abs(each_view).max())
 
 
-@pytest.mark.parametrize("part", range(4))
+@pytest.mark.parametrize(
+    "part", [0, 1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
+)
 def test_any_effects_together_keep_the_law_and_can_be_drawn_again(tmp_path, part):
     """Each stream is replayed frame by frame and redrawn by the reference; its codes have the means of the law.
 

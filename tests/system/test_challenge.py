@@ -28,12 +28,13 @@ def small(frames: int, height: int, width: int, grey: bool = False) -> str:
     return text
 
 
-def to_submission(folder: Path) -> dict[str, object]:
+def to_submission(folder: Path, method: str) -> dict[str, object]:
     """Check a data set, write its cubes, restore those of the test split, and report; return the description."""
     data, out = folder / "data", folder / "cubes"
     assert main(["check", str(data)]) == 0
     assert main(["convert", str(data), str(out), "--to", "challenge", "--window", "64"]) == 0
-    assert quiver(["restore", str(out / "test"), "-o", str(folder / "s.zip"), "--planes", "3", "--method", "qbp"]) == 0
+    line = ["restore", str(out / "test"), "-o", str(folder / "s.zip"), "--planes", "3", "--method", method]
+    assert quiver(line) == 0
     assert main(["report", str(data), "-o", str(folder / "report.html")]) == 0
     with zipfile.ZipFile(folder / "s.zip") as archive:
         assert (
@@ -55,7 +56,7 @@ def test_the_shipped_recipe_has_the_size_of_the_benchmark():
 def test_from_the_recipe_to_a_submission(tmp_path):
     """64 planes of an odd size, drawn from a quick renderer of tests: every clip becomes one cube with its truth."""
     generation.generate(recipe.parse(small(64, 16, 13, grey=True)), tmp_path / "data", fakes.HERE, make=fakes.make)
-    found = to_submission(tmp_path)
+    found = to_submission(tmp_path, "moment")
     assert isinstance(found["psnr"], float)
     every = {split: cubes(tmp_path / "cubes" / split) for split in ("train", "test")}
     assert [cube.name for cube in every["train"]] == [
@@ -75,7 +76,7 @@ def test_rendered_scenes_in_the_layout(tmp_path):
     (tmp_path / "small.toml").write_text(text[: text.index('[[scenes]]\nfamily = "room"')] + text[text.index(
         '[[scenes]]\nfamily = "text"') :])  # fmt: skip
     assert main(["generate", str(tmp_path / "small.toml"), "-o", str(tmp_path / "data"), "--workers", "0"]) == 0
-    found = to_submission(tmp_path)
+    found = to_submission(tmp_path, "qbp")
     (cube,) = cubes(tmp_path / "cubes" / "test")
     truth = cube.truth()
     assert truth is not None
