@@ -163,4 +163,4 @@ def difference(result: Result, wanted: Array, errors: Array | None = None) -> st
     if not off.any():
         return None
     mean = np.mean(wanted[finite])
-    return f"{off.sum()} of {off.size} differ, by up to {apart[off].max():.3g}, mean {mean:.6g}"
+    return f"{off.sum()} of {off.size} differ, by up to {np.nanmax(np.append(apart[off], 0.0)):.3g}, mean {mean:.6g}"
