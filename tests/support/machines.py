@@ -35,6 +35,7 @@ Array = np.ndarray
 FIT = 1e-3  # of the standard error
 INTERVAL = 2 * 1.959963984540054  # width of an interval of 95 %, in standard errors
 P_VALUE_ERROR = 1 / sqrt(12)  # standard deviation of a p-value where the model is right: it is uniform
+LEAST = 1e-6  # smaller numbers are what is left where terms of this size, at least, cancel
 LARGEST_EXPONENT = 745  # exp(-745) is the least double: the logarithm of a probability is off by this many eps
 DENOISER_TERMS = 16 * 9 * 64  # layers of Open Image Denoise, each a sum over 3 x 3 pixels of about 64 channels
 EDGE_RAYS = 4e-6  # share of rays that take another way: 32 px are known to 32 eps of single precision, one edge a pixel
@@ -67,7 +68,7 @@ def standard_errors(values: Any, low: Any, high: Any) -> Array:
 class Sums:
     """Sums of `terms` terms, computed in `dtype`, of the size `of`.
 
-    `of` is "mean" (the mean size of all numbers), "each" (the size of each number) or a size in their unit.
+    `of` is "mean" (the mean size of all numbers), "each" (that of each number, at least 1e-6) or a size in their unit.
     """
 
     values: Array
@@ -79,7 +80,7 @@ class Sums:
         """The largest difference of each number."""
         size: Any = self.of
         if self.of == "each":
-            size = np.abs(wanted)
+            size = np.maximum(np.abs(wanted), LEAST)
         elif self.of == "mean":
             size = np.mean(np.abs(wanted[np.isfinite(wanted)]))
         return np.broadcast_to(np.asarray(self.terms) * eps(self.dtype) * size, wanted.shape)
