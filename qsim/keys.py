@@ -23,6 +23,7 @@ from numpy import ndarray as Array
 ROUNDS = 7  # of Philox4x32; Dr.Jit's default
 MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
 KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+COUNTED = 1 << 32  # frames (or planes), rows and columns that have a counter of 32 bits
 _BATCH = 1 << 13  # blocks that stay in the cache
 _LOW, _SHIFT = np.uint64(0xFFFFFFFF), np.uint64(32)
 
@@ -42,7 +43,7 @@ class Key:
                 object.__setattr__(self, name, index(getattr(self, name)))
             except TypeError:
                 raise ValueError(f"Key.{name} is an integer, got {getattr(self, name)!r}") from None
-        if not 0 <= self.frame < 2**32:
+        if not 0 <= self.frame < COUNTED:
             raise ValueError(f"Key.frame counts frames from 0 to 2^32 - 1, got {self.frame}")
 
     def at(self, frame: int) -> Key:
@@ -80,17 +81,37 @@ def philox4x32(counters: Array, key: int) -> Array:
     return state.astype(np.uint32)
 
 
+def require_counters(key: Key, shape: tuple[int, ...], origin: tuple[int, int] = (0, 0), planes: int = 1) -> None:
+    """Raise `ValueError` unless all frames, rows and columns of a draw [H, W] or [T, H, W] have a counter.
+
+    `origin` (y, x) places the crop in the full frame. A sum of `planes` takes as many counters per frame.
+    """
+    *frames, height, width = shape
+    try:
+        y, x = (index(place) for place in origin)
+    except (TypeError, ValueError):
+        raise ValueError(f"origin is a row and a column of the full frame, got {origin!r}") from None
+    first, count = key.frame * planes, planes * (frames[0] if frames else 1)
+    _require_counted("frames" if planes == 1 else f"planes ({planes} per frame)", first, count)
+    _require_counted("rows", y, height)
+    _require_counted("columns", x, width)
+
+
+def _require_counted(name: str, first: int, count: int) -> None:
+    if first < 0 or first + count > COUNTED:
+        raise ValueError(
+            f"{name} {first} to {first + count - 1}: random numbers have counters from 0 to 2^32 - 1; "
+            "begin at another frame, or place the crop in the full frame"
+        )
+
+
 def words(key: Key, shape: tuple[int, ...], origin: tuple[int, int] = (0, 0), redraw: int = 0) -> Array:
     """Return a word per pixel of the crop at `origin` = (y, x): uint32 [H, W], or [T, H, W] of frames key.frame + t."""
+    require_counters(key, shape, origin)
     *frames, height, width = shape
     y, x = origin
-    last_frame = key.frame + (frames[0] if frames else 1)
-    if min(y, x, redraw) < 0 or max(y + height, x + width, redraw + 1, last_frame) > 2**32:
-        raise ValueError(
-            f"frame {key.frame}, origin {origin} and redraw {redraw} are counted from 0 to 2^32 - 1 in the full frame"
-        )
     first, last = x >> 2, (x + width + 3) >> 2
-    blocks = (last_frame - key.frame, height, last - first)
+    blocks = (frames[0] if frames else 1, height, last - first)
     result = np.empty((prod(blocks), 4), np.uint32)
     for start in range(0, len(result), _BATCH):
         some = np.arange(start, min(start + _BATCH, len(result)))
@@ -104,6 +125,10 @@ def words(key: Key, shape: tuple[int, ...], origin: tuple[int, int] = (0, 0), re
 def words_at(key: Key, at: Array, redraw: int = 0) -> Array:
     """The words of single pixels, int [3, p] = (frame, row, column) of the full frame: uint32 [p]."""
     frame, y, x = at
+    for name, places in (("frames", frame), ("rows", y), ("columns", x)):
+        if places.size:
+            first = int(places.min())
+            _require_counted(name, first, int(places.max()) - first + 1)
     blocks = philox4x32(np.stack([x >> 2, y, frame, np.full_like(x, redraw)]), key.philox_key)
     return blocks[x & 3, np.arange(x.size)]
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
-from qsim.keys import Key, words, words_at
+from qsim.keys import Key, require_counters, words, words_at
 from qsim.sensor import estimation
 from qsim.sensor.compiled.plan import Plan
 from qsim.sensor.distribution import Distribution, check_exposure
@@ -73,6 +73,11 @@ class Sensor(Distribution):
         """Return this sensor with another dark rate [1/s], for maps of it; a model overrides this."""
         raise ValueError(f"{type(self).__name__}: has no dark rate that a map could change")
 
+    @property
+    def counters(self) -> int:
+        """Return the frame counters of the random numbers that one code takes; a sum of planes has one per plane."""
+        return 1
+
     def kernel_plan(self, exposure: float) -> Plan | None:
         """Return how a compiled kernel draws the codes of this sensor; None where only the reference draws them.
 
@@ -91,6 +96,7 @@ class Sensor(Distribution):
         """
         photons = _checked(photons, engine)
         check_exposure(exposure)
+        require_counters(key, photons.shape, origin, self.counters)
         plan = None if engine == "reference" else self._usable_plan(photons, exposure)
         if plan is not None:
             from qsim.sensor.compiled import launch
@@ -115,6 +121,7 @@ class Sensor(Distribution):
         """
         photons = _checked(photons, engine)
         check_exposure(exposure)
+        require_counters(key, photons.shape, origin, self.counters)
         direct = engine != "reference" and origin[1] % 4 == 0
         plan = self._usable_plan(photons, exposure) if direct else None
         if plan is None:
@@ -138,6 +145,7 @@ class Sensor(Distribution):
         if len(shape) != 3 or not 0 < prod(shape) < 1 << 32 or "float32" not in str(photons.dtype):
             wanted = "photons have the shape [T, H, W] in float32, 1 to 2^32 - 1 of them"
             raise ValueError(f"{wanted}; got {list(shape)} in {photons.dtype}")
+        require_counters(key, shape, origin, self.counters)
         if fast_engine_works():
             from qsim.sensor.compiled import jit
 

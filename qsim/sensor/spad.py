@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.keys import Key, normal, uniform_pair, words
+from qsim.keys import Key, normal, require_counters, uniform_pair, words
 from qsim.sensor.compiled.plan import MOST_BITS, Live, Plan
 from qsim.sensor.distribution import require_bits, require_number
 from qsim.sensor.qis_steps import search
@@ -73,6 +73,10 @@ class BinarySPAD(SPAD):
         """Return the number of binary planes in one code, M = 2^bits - 1."""
         return self.levels - 1
 
+    @property
+    def counters(self) -> int:
+        return self.planes if self.bits <= _PLANES_BITS else 1
+
     def cdf_of(self, arrivals: Array, exposure: float) -> Array:
         cdf = np.minimum(np.cumsum(np.exp(self.log_pmf_of(arrivals, exposure)), axis=1), 1.0)
         cdf[:, -1] = 1.0
@@ -115,6 +119,7 @@ class BinarySPAD(SPAD):
                 f"planes of a {self.bits}-bit code come in groups of {self.planes}: [T {self.planes}, H, W], "
                 f"got {list(photons.shape)}"
             )
+        require_counters(key, (len(photons) // self.planes, *photons.shape[1:]), origin, self.planes)
         single = replace(self, bits=1)
         codes = np.empty((len(photons) // self.planes, *photons.shape[1:]), self.dtype)
         for t in range(len(codes)):

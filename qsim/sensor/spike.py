@@ -22,7 +22,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
-from qsim.keys import Key, uniform, uniform_pair, words
+from qsim.keys import Key, require_counters, uniform, uniform_pair, words
 from qsim.sensor.distribution import check_exposure, require_number
 from qsim.sensor.poisson import poisson_log_pmf, poisson_quantile
 from qsim.sensor.sensor import Sensor
@@ -121,6 +121,7 @@ class SpikeCamera(Sensor):
         stack = photons if photons.ndim == 3 else photons[None]
         if stack.ndim != 3:
             raise ValueError(f"photons have the shape [H, W] or [T, H, W], got {list(photons.shape)}")
+        require_counters(key, stack.shape, origin)
         spikes = np.concatenate(list(self.spikes([stack], exposure, key, origin)))
         return spikes if photons.ndim == 3 else spikes[0]
 

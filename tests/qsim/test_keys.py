@@ -109,7 +109,7 @@ def test_parts_that_are_no_integers_are_named():
         Key(1.5, 0)
     with pytest.raises(ValueError, match=r"^Key.frame counts frames from 0 to 2\^32 - 1, got -1$"):
         Key(0, 0, -1)
-    with pytest.raises(ValueError, match=r"origin \(-1, 0\)"):
+    with pytest.raises(ValueError, match=r"^rows -1 to 0: random numbers have counters from 0 to 2\^32 - 1"):
         words(Key(0, 0), (2, 2), (-1, 0))
     assert Key(np.int64(3), np.uint8(4)) == Key(3, 4)
 

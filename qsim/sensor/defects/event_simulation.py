@@ -24,7 +24,7 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.keys import Key
+from qsim.keys import Key, require_counters
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.correlated_noise import CorrelatedNoise
 from qsim.sensor.defects.defect_table import Defects
@@ -103,6 +103,7 @@ def sample(
     if not frame_time >= exposure > 0:
         raise ValueError(f"frame_time {frame_time!r} s must be at least the exposure {exposure!r} s, both above 0")
     sensor.arrivals(photons, exposure)  # checks the light level
+    require_counters(key, (len(photons), *photons.shape[2:]), origin)
     found = effects(sensor, photons, exposure, frame_time, memory)
     if found.largest <= TOLERANCE:
         return sensor.sample(photons.sum(axis=1), exposure, key=key, origin=origin), found, "closed form"

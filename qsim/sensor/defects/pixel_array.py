@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.arrays import plain
-from qsim.keys import Key
+from qsim.keys import Key, require_counters
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.correlated_noise import CorrelatedNoise
 from qsim.sensor.defects.defect_table import Defects
@@ -143,6 +143,7 @@ class PixelArray:
         stack = plain(photons)
         if stack.ndim != 3:
             raise ValueError(f"photons have the shape [T, H, W], got {list(stack.shape)}")
+        require_counters(key, stack.shape, origin, self.sensor.counters)
         if noise.crosstalk and isinstance(self.sensor, QIS):
             raise ValueError("crosstalk: a QIS has no avalanches; blur the light instead")
         if clocked and self.sensor.bits > 1 and (noise.afterpulse or noise.crosstalk):

@@ -7,8 +7,12 @@ import sys
 import numpy as np
 import pytest
 from compiled_cases import EXPOSURE, KEY, OTHERS, SENSORS, fast, fast_packed, light, needs_engine, reference
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from qsim.keys import Key
 from qsim.sensor.compiled import launch
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.packing import pack
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
@@ -143,7 +147,9 @@ def test_single_pixels_are_those_of_the_frame(name):
 MEMORY = """
 import os, tracemalloc
 import numpy as np
+from qsim.keys import Key
 from qsim.sensor.compiled import launch
+from qsim.sensor.counting import CountingSPAD
 from qsim.keys import Key
 from qsim.sensor.qis import QIS
 sensor, photons = QIS(0.8, 1.6, 0.2, 3), np.full((40, 256, 255), 2.0)
@@ -193,3 +199,80 @@ def test_no_kernel_reads_beyond_its_light():
     """32 bytes below two mebibytes: the last packet reached into a missing page, which ended the process."""
     done = subprocess.run([sys.executable, "-c", ODD], timeout=120, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+# ---- The counters of random numbers end
+
+
+def _outcome(draw, *arguments, **options) -> str | list[int]:
+    """Codes as numbers, or the sentence of the refusal."""
+    try:
+        return np.asarray(draw(*arguments, **options)).ravel().tolist()
+    except ValueError as error:
+        return str(error)
+
+
+LIMIT = 1 << 32
+
+
+COUNTED_BY = [
+    *(BinarySPAD(0.4, 20.0, bits) for bits in (1, 3, 8, 9, 16)),  # up to 8 bits a counter per plane
+    QIS(0.8, 1.6, 0.2, 3),
+    QIS(0.8, 1.6, 0.2, 12),
+    CountingSPAD(0.5, 100.0, 1e-6, 4),
+    CountingSPAD(0.5, 100.0, 1e-6, 12),
+]
+CASES = [(sensor, LIMIT // sensor.counters) for sensor in COUNTED_BY]
+
+
+def _near(end: int, farthest: int) -> st.SearchStrategy[int]:
+    """At the beginning, around the end, or anywhere."""
+    return st.one_of(st.integers(0, 9), st.integers(end - 9, end + 2), st.integers(-3, farthest))
+
+
+@needs_engine
+@settings(max_examples=100, deadline=None)
+@given(
+    case=st.sampled_from(CASES).flatmap(lambda case: st.tuples(st.just(case[0]), _near(case[1], 1 << 40))),
+    row=_near(LIMIT, 1 << 33),
+    column=_near(LIMIT, 1 << 33),
+)
+def test_both_engines_end_at_the_same_frame_row_and_column(case, row, column):
+    """They draw the same codes or refuse by the same sentence: the compiled counters of 32 bits began again at 0."""
+    sensor, frame = case
+    frames = 2
+    if not 0 <= frame < LIMIT:
+        with pytest.raises(ValueError, match=r"^Key\.frame counts frames"):
+            Key(1, 2, frame=frame)
+        return
+    photons = light(sensor, (frames, 2, 3))
+    where = {"key": Key(1, 2, frame=frame), "origin": (row, column)}
+    expected = _outcome(sensor.sample, photons, EXPOSURE, engine="reference", **where)
+    assert _outcome(sensor.sample, photons, EXPOSURE, engine="fast", **where) == expected
+    packed = _outcome(sensor.sample_packed, photons, EXPOSURE, engine="fast", **where)
+    assert packed == _outcome(sensor.sample_packed, photons, EXPOSURE, engine="reference", **where)
+    if isinstance(expected, str):
+        assert expected == packed == _outcome(sensor.sample_on_device, photons, EXPOSURE, **where)
+    inside = (frame + frames) * sensor.counters <= LIMIT and min(row, column) >= 0 and max(row + 2, column + 3) <= LIMIT
+    assert isinstance(expected, list) == inside
+
+
+@needs_engine
+def test_planes_of_a_clip_end_at_the_same_plane():
+    sensor = BinarySPAD(0.4, 20.0, 3)
+    photons = light(sensor, (7, 2, 3))
+    last = LIMIT // 7 - 1
+    drawn = [sensor.sample_planes(photons, EXPOSURE, key=Key(1, 2, last), engine=e) for e in ("fast", "reference")]
+    np.testing.assert_array_equal(*drawn)
+    for engine in ("fast", "reference"):
+        with pytest.raises(ValueError, match=r"^planes \(7 per frame\) 4294967292 to 4294967298: random numbers have"):
+            sensor.sample_planes(photons, EXPOSURE, key=Key(1, 2, last + 1), engine=engine)
+
+
+@needs_engine
+@pytest.mark.parametrize("origin", [(-1, 0), (0, -1), (0.5, 0), (1,), None])
+def test_an_origin_outside_of_the_frame_is_refused(origin):
+    photons = np.ones((2, 3))
+    for engine in ("fast", "reference"):
+        with pytest.raises(ValueError, match=r"^(rows -1 to 0|columns -1 to 1|origin is a row and a column)"):
+            BinarySPAD(0.4, 20.0).sample(photons, EXPOSURE, key=KEY, origin=origin, engine=engine)
