@@ -2,16 +2,45 @@
 
 from __future__ import annotations
 
+import functools
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 from qsim import llvm
 from qsim.backend import INSTALL_HINT, RenderEngine, choose, limit_threads
+from qsim.device_lock import one_thread_at_a_time
 
 
+class OfVariant(Protocol):
+    """What was loaded with a Mitsuba variant."""
+
+    @property
+    def variant(self) -> str: ...
+
+
+P = ParamSpec("P")
+S = TypeVar("S", bound=OfVariant)
+T = TypeVar("T")
+
+
+def in_own_variant(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
+    """Return a method under the lock of the renderer, with the variant of its object.
+
+    Between two calls another thread may have activated another variant.
+    """
+
+    @functools.wraps(method)
+    def alone(self: S, /, *arguments: P.args, **options: P.kwargs) -> T:
+        _set_variant(self.variant)
+        return method(self, *arguments, **options)
+
+    return one_thread_at_a_time(alone)
+
+
+@one_thread_at_a_time
 def select(prefer: str | None = None) -> RenderEngine:
     """Choose (once per process) and activate an engine; `prefer` or QSIM_ENGINE requires "cuda", "llvm" or "scalar".
 
@@ -29,15 +58,20 @@ def in_colour(engine: RenderEngine) -> RenderEngine:
     return replace(engine, variant=engine.variant.replace("_mono", "_rgb"))
 
 
+@one_thread_at_a_time
 def activate(engine: RenderEngine) -> None:
     """Make this engine's variant the current one; cheap if it is already active."""
     if engine.llvm_path:
         llvm.prepare(engine.llvm_path)
+    _set_variant(engine.variant)
+    limit_threads()
+
+
+def _set_variant(variant: str) -> None:
     import mitsuba as mi
 
-    if mi.variant() != engine.variant:
-        mi.set_variant(engine.variant)
-    limit_threads()
+    if mi.variant() != variant:
+        mi.set_variant(variant)
 
 
 @contextmanager
@@ -70,6 +104,7 @@ def errors_only(mi: Any) -> Iterator[None]:
         mi.set_log_level(level)
 
 
+@one_thread_at_a_time
 def free_memory(engine: RenderEngine) -> None:
     """Give the memory of unused arrays back to the system; Dr.Jit keeps it for new arrays of equal size."""
     if engine.backend == "scalar":

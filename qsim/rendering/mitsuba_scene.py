@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.device_lock import one_thread_at_a_time
 from qsim.rendering import mitsuba_xml
 from qsim.rendering.engine import errors_only, opaque
 from qsim.rendering.mitsuba_mesh import NORMALS, POSITIONS, mesh_shape, vertex_normals
@@ -38,6 +39,7 @@ class Stage:
     def __init__(self, mi: Any, scene: Scene, smooth_weight: float = SMOOTH_WEIGHT) -> None:
         """Load the scene; a `smooth_weight` of 1 is Mitsuba's default."""
         self.mi, self.scene = mi, scene
+        self.variant: str = mi.variant()
         self.loaded = (
             mi.load_dict(_scene_dict(mi, scene, smooth_weight))
             if scene.file is None
@@ -50,6 +52,11 @@ class Stage:
         self._rest_normals: dict[str, Array] = {}
         self._time: float | None = None  # of the last placement [s]
         self._steady = {name: self._emission(name) for name in scene.flickers}
+
+    @one_thread_at_a_time
+    def __del__(self) -> None:
+        """Free the scene under the lock: another thread may be rendering."""
+        vars(self).clear()
 
     def place(self, t: float) -> None:
         """Move everything to time t [s]; parameters equal to those of the last call are not set again."""

@@ -20,6 +20,7 @@ import numpy as np
 
 from qsim import files
 from qsim.checks import suggest
+from qsim.device_lock import one_thread_at_a_time
 from qsim.optics.camera import Camera, Pose, Vector
 from qsim.optics.lens import Lens
 from qsim.optics.radiometry import RGB
@@ -38,6 +39,7 @@ EMISSION = (  # what scales a light: lamp or glow, even, point or spot, parallel
 )
 
 
+@one_thread_at_a_time
 def read_mitsuba(
     xml: str | Path,
     motions: Mapping[str, Pose] | None = None,

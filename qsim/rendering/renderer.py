@@ -23,13 +23,14 @@ from numpy import ndarray as Array
 
 from qsim.backend import RenderEngine
 from qsim.clip.clamped_error import Errors, error_at, frame_errors, rms, white_in
+from qsim.device_lock import one_thread_at_a_time
 from qsim.keys import Key, hash_name, words
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.rendering import ground_truth
 from qsim.rendering.budget import Budget, as_bright, blur_left, grid_samples, instants, light_windows
 from qsim.rendering.camera_rays import CameraRays, Film
 from qsim.rendering.denoiser import cleaned_mean
-from qsim.rendering.engine import activate, in_colour, select
+from qsim.rendering.engine import activate, in_colour, in_own_variant, select
 from qsim.rendering.mitsuba_scene import Stage, film_pass
 from qsim.rendering.ray_casting import RayCaster, pixel_rays
 from qsim.rendering.reuse.carrying import Carrier, unshared
@@ -77,6 +78,7 @@ class Renderer:
     frames cannot share samples.
     """
 
+    @one_thread_at_a_time
     def __init__(
         self,
         scene: Scene,
@@ -115,6 +117,11 @@ class Renderer:
             self._carrier = self._whole.carrier(self.budget, frames)
 
     @property
+    def variant(self) -> str:
+        """The Mitsuba variant that loaded the scene."""
+        return self.engine.variant
+
+    @property
     def crop(self) -> Crop:
         """The window (y, x, height, width) in the camera's frame."""
         return self.film.crop
@@ -138,9 +145,9 @@ class Renderer:
         middle, half = np.arange(frames) / self.frame_rate, self.exposure / 2
         return {name: flicker.mean(middle - half, middle + half) for name, flicker in self.scene.flickers.items()}
 
+    @in_own_variant
     def frame(self, t: int, *, with_truth: bool = True) -> Frame:
         """Render frame t: arrays of the window's height and width [H, W]."""
-        activate(self.engine)
         exposed = self._shared(t, self._whole) if self._whole else self._exposed(self.instants(t), self.key(t))
         radiance, error, errors_at, fireflies = exposed
         sharp = None
@@ -162,6 +169,7 @@ class Renderer:
         count = self.budget.sub_frames if self.shutter > 0 else 1
         return instants(self.time(t), self.shutter / self.frame_rate, count)
 
+    @in_own_variant
     def halves(self, instants: list[float], budget: Budget, key: Key) -> Array:
         """Return independent estimates A, B of the mean radiance over the instants [s], float64 [2, H, W].
 
@@ -172,6 +180,7 @@ class Renderer:
         found[:, ~np.isfinite(found).all(axis=0)] = 0
         return found
 
+    @in_own_variant
     def means(self, instants: list[float], budget: Budget, key: Key) -> Array:
         """Return means of all instants, of every third one, and of the middle one, in halves, float64 [3, 2, H, W].
 
@@ -208,6 +217,7 @@ class Renderer:
         """Return the random key of frame t; seed, scene and stage select the samples."""
         return replace(self._key, frame=t, stage=stage)
 
+    @in_own_variant
     def carrier(self, budget: Budget, frames: int | None, stage: int = RENDER_STAGE) -> Carrier:
         """Return what carries samples between the frames 0 .. frames - 1 (None: all) of this window.
 
@@ -252,6 +262,7 @@ class Renderer:
         whole = math.hypot(error, blur_left(means, len(instants)), self.budget.left_out)
         return radiance.astype(np.float32), whole, frame_errors(clamped, white), fireflies
 
+    @in_own_variant
     def surfaces(self, instants: list[float], key: Key) -> tuple[Array, Array]:
         """Return albedo [H, W] or [3, H, W] (1 for mirrors and misses) and normals [H, W, 3], for the denoiser."""
         if self.engine.backend == "scalar":
@@ -306,6 +317,7 @@ class Renderer:
             self._integrators[bounces] = self.mi.load_dict(plugin)
         return self._integrators[bounces]
 
+    @in_own_variant
     def truth(self, t: int) -> dict[str, Array]:
         """Return flow, validity, depth and body of frame t at mid-exposure, as in `Frame`."""
         camera, now, after, shape = self.scene.camera, self.time(t), self.time(t + 1), self.shape
@@ -324,6 +336,7 @@ class Renderer:
             "body_id": hits.number.reshape(shape),
         }
 
+    @in_own_variant
     def motion_extent(self, t: int) -> tuple[Array, Array]:
         """Return the image-space motion per exposure [px] and the body index of the first hit, both [H, W].
 

@@ -26,6 +26,7 @@ from numpy import ndarray as Array
 
 from qsim.keys import Key, words
 from qsim.rendering.camera_rays import Film
+from qsim.rendering.engine import in_own_variant
 from qsim.rendering.ground_truth import body_pose
 from qsim.rendering.mitsuba_scene import Stage
 from qsim.rendering.ray_casting import RayCaster, pixel_rays
@@ -88,6 +89,12 @@ class Carrier:
     key: Callable[[int], Key]
     _kept: dict[int, Traced] = field(default_factory=dict)
 
+    @property
+    def variant(self) -> str:
+        """The Mitsuba variant that loaded the scene."""
+        return self.stage.variant
+
+    @in_own_variant
     def pictures(self, t: int) -> Array:
         """Return pictures of frame t from 1, 3, 5 ... frames, float64 [n, 2 halves, H, W]; the first is its own.
 

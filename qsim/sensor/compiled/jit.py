@@ -14,6 +14,7 @@ from numpy import ndarray as Array
 
 from qsim import backend as engine
 from qsim import llvm
+from qsim.device_lock import one_thread_at_a_time
 from qsim.keys import KEY_STEPS, MULTIPLIERS, ROUNDS
 
 _PACKET = 16  # numbers that a kernel works on at a time, at most
@@ -29,6 +30,7 @@ def available() -> bool:
 
 
 @cache
+@one_thread_at_a_time
 def backend() -> Any:
     """Return `drjit.cuda` or `drjit.llvm`; None where neither works on this machine."""
     with warnings.catch_warnings():

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.device_lock import one_thread_at_a_time
 from qsim.keys import Key
 from qsim.sensor.compiled import lookup
 from qsim.sensor.compiled.curves import Curves
@@ -24,6 +25,7 @@ _CERTAIN = 80.0  # arrivals at which 15 are certain: P(N < 15) = 1e-19
 CONSTANT_PLANS = 32  # plans of a process whose numbers are constants of their kernels
 
 
+@one_thread_at_a_time
 def cdf_steps(plan: Plan, photons: Array) -> Array:
     """Return the kernel's steps F_0 ... of one plane, for validation: photons [p] -> float64 [p, steps]."""
     import drjit as dr

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.device_lock import one_thread_at_a_time
 from qsim.keys import Key
 from qsim.sensor.compiled.jit import whole_packets
 from qsim.sensor.compiled.kernel import fixed_scalars, start
@@ -31,6 +32,7 @@ LARGEST = 1 << 22  # pixels of a launch: small frames share one, large frames ta
 Exact = Callable[[Array], Array]  # pixels int [3, p] = (t, y, x) of photons [T, H, W] -> codes [p] of the reference
 
 
+@one_thread_at_a_time
 def sample(plan: Plan, photons: Array, key: Key, origin: tuple[int, int], exact: Exact) -> Array:
     """Return codes uint8 [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`.
 
@@ -53,6 +55,7 @@ def sample(plan: Plan, photons: Array, key: Key, origin: tuple[int, int], exact:
     return codes
 
 
+@one_thread_at_a_time
 def sample_packed(plan: Plan, photons: Array, bits: int, key: Key, origin: tuple[int, int], exact: Exact) -> Array:
     """Return packed codes uint8 [T, H, ceil(W bits / 8)] (packing.py), without writing a byte per code.
 

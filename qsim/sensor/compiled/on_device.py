@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.device_lock import one_thread_at_a_time
 from qsim.keys import Key
 from qsim.sensor.compiled.jit import backend
 from qsim.sensor.compiled.kernel import fixed_scalars, start
@@ -23,6 +24,7 @@ from qsim.sensor.compiled.plan import Plan
 Exact = Callable[[Array, Array], Array]  # photons float32 [p], pixels int [3, p] = (t, y, x) -> the reference's codes
 
 
+@one_thread_at_a_time
 def sample(
     plan: Plan, photons: Any, shape: tuple[int, int, int], key: Key, origin: tuple[int, int], exact: Exact
 ) -> Any:
