@@ -15,10 +15,10 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.keys import Key, normal, uniform_pair, words
-from qsim.sensor import paralyzable_steps
+from qsim.sensor import counting_moments, paralyzable_steps
 from qsim.sensor.compiled.curves import Curves, below, by_pairs, falling
 from qsim.sensor.compiled.plan import MOST_BITS, Live, Plan
-from qsim.sensor.distribution import require_number
+from qsim.sensor.distribution import LONGEST, SHORTEST, check_exposure, require_number, require_size
 from qsim.sensor.paralyzable import Paralyzable, most_counts
 from qsim.sensor.poisson import poisson_log_pmf
 from qsim.sensor.qis_steps import decide, search
@@ -49,6 +49,7 @@ class CountingSPAD(SPAD):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_number(self, "dead_time", 0)
+        require_size(self, "dead_time", SHORTEST, LONGEST)
         if not isinstance(self.paralyzable, bool):
             raise ValueError(f"CountingSPAD.paralyzable is true or false, got {self.paralyzable!r}")
 
@@ -118,8 +119,51 @@ class CountingSPAD(SPAD):
         result[:, 0] = -arrivals
         return result
 
+    def code_laws(self, codes: Array, arrivals: float, exposure: float) -> tuple[Array, Array]:
+        from scipy.special import gammainc, gammaincc
+
+        if self.dead_time_law(exposure) is not None:
+            return super().code_laws(codes, arrivals, exposure)
+        shares = [np.maximum(1 - (codes - step) * (self.dead_time / exposure), 0) for step in (1, 0)]
+        before, live = (arrivals * share for share in (np.where(codes > 0, shares[0], 1.0), shares[1]))
+        at_once = poisson_log_pmf(before, codes)
+        with np.errstate(divide="ignore"):
+            lower = gammainc(codes + 1.0, before) - gammainc(codes + 1.0, live)
+            upper = gammaincc(codes + 1.0, live) - gammaincc(codes + 1.0, before)
+            pmf = np.exp(at_once) + np.where(before < codes + 1, lower, upper)
+            top = codes == self.levels - 1
+            pmf[top] = gammainc(codes[top], before[top])
+            tail = _log_tail(at_once, before, live, codes)
+            logs = np.where(pmf > _UNDERFLOW, np.log(np.maximum(pmf, _UNDERFLOW)), tail)
+            logs[codes == 0] = -arrivals
+            less = np.log(shares[1]) + poisson_log_pmf(live, codes)
+            more = np.log(shares[0]) + poisson_log_pmf(before, np.maximum(codes - 1, 0))
+        with np.errstate(over="ignore", invalid="ignore"):
+            gained = np.where(codes > 0, np.exp(more - logs), 0.0)
+            return logs, gained - np.where(top, 0.0, np.exp(less - logs))
+
+    def moments_of(self, arrivals: Array, exposure: float) -> tuple[Array, Array]:
+        from scipy.special import gammainc, gammaincc
+
+        law = self.dead_time_law(exposure)
+        if law is not None:
+            return law.moments(arrivals)
+        if not self.many_codes:
+            return self.dense_moments_of(arrivals, exposure)
+        share = self.dead_time / exposure
+
+        def tail(k: Array, mean: Array, below: Array) -> Array:
+            live = mean * np.maximum(1 - k * share, 0)
+            result = np.empty(len(k))
+            result[below] = gammaincc(k[below] + 1.0, live[below])
+            result[~below] = gammainc(k[~below] + 1.0, live[~below])
+            return result
+
+        return counting_moments.moments(arrivals, share, self.levels - 1, tail)
+
     def kernel_plan(self, exposure: float) -> Plan | None:
         """Return a plan of sums of k + 1 Poisson terms for few bits; of curves for more bits, and if paralyzable."""
+        check_exposure(exposure)
         if self.bits > MOST_BITS:
             return None
         dark, count, law = self.dark_rate * exposure, self.levels - 1, self.dead_time_law(exposure)

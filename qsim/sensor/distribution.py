@@ -27,6 +27,11 @@ from numpy import ndarray as Array
 from qsim.arrays import plain
 from qsim.keys import uniform, uniform_pair
 
+_TOGETHER = 1 << 22  # probabilities held at a time
+MOST_EVENTS = 1e15  # expected per exposure; every sensor within the limits of its numbers is saturated by less
+LONGEST, SHORTEST = 1e9, 1e-18  # s, of an exposure
+MANY_BITS = 9  # from which moments are computed from the codes near the mean
+
 
 class Distribution(ABC):
     """The law of the codes of one pixel. Subclasses are frozen dataclasses of its parameters."""
@@ -74,7 +79,7 @@ class Distribution(ABC):
         return np.uint8 if self.bits <= 8 else np.uint16
 
     def arrivals(self, photons: Array, exposure: float) -> Array:
-        """Return the expected Poisson events per exposure [s]: photons [...] -> float64 [...].
+        """Return the expected Poisson events per exposure [s]: photons [...] -> float64 [...], at most MOST_EVENTS.
 
         `ValueError` names the first value of `photons` that is negative or not finite.
         """
@@ -87,7 +92,8 @@ class Distribution(ABC):
                 f"photons{list(where) if where else ''} is {float(values[where])!r}; "
                 "expected photons are finite and not negative"
             )
-        return self.efficiency * values + self.dark_rate * exposure
+        with np.errstate(over="ignore"):
+            return np.minimum(self.efficiency * values + self.dark_rate * exposure, MOST_EVENTS)
 
     def cdf(self, photons: Array, exposure: float) -> Array:
         """Return P(code <= k): photons [...] -> float64 [..., levels]."""
@@ -118,12 +124,50 @@ class Distribution(ABC):
 
     def mean(self, photons: Array, exposure: float) -> Array:
         """Return the expected code: photons [...] -> float64 [...]."""
-        return self.pmf(photons, exposure) @ np.arange(self.levels, dtype=float)
+        return self.moments(photons, exposure)[0]
 
     def variance(self, photons: Array, exposure: float) -> Array:
         """Return the variance of the code: photons [...] -> float64 [...]."""
-        pmf, codes = self.pmf(photons, exposure), np.arange(self.levels, dtype=float)
-        return np.sum(pmf * (codes - (pmf @ codes)[..., None]) ** 2, axis=-1)
+        return self.moments(photons, exposure)[1]
+
+    def moments(self, photons: Array, exposure: float) -> tuple[Array, Array]:
+        """Return mean and variance of the code: photons [...] -> float64 [...] each."""
+        arrivals = self.arrivals(photons, exposure)
+        mean, variance = self.moments_of(arrivals.ravel(), exposure)
+        return mean.reshape(arrivals.shape), variance.reshape(arrivals.shape)
+
+    @property
+    def many_codes(self) -> bool:
+        """Return whether tables over all codes would take long, and series or sums near the mean replace them."""
+        return self.bits >= MANY_BITS
+
+    def moments_of(self, arrivals: Array, exposure: float) -> tuple[Array, Array]:
+        """Return mean and variance of the code: Poisson means [p] -> [p] each.
+
+        A model overrides this where codes are many; `dense_moments_of` is the reference.
+        """
+        return self.dense_moments_of(arrivals, exposure)
+
+    def code_laws(self, codes: Array, arrivals: float, exposure: float) -> tuple[Array, Array]:
+        """Return log P(code) of some codes int [c] at one Poisson mean, and its derivative by that mean: [c] each."""
+        light = np.array([arrivals])
+        logs = self.log_pmf_of(light, exposure)[0, codes]
+        change = np.diff(self.slope_of(light, exposure)[0], prepend=0.0)[codes]
+        with np.errstate(over="ignore", invalid="ignore"):
+            return logs, np.where(change == 0, 0.0, change * np.exp(-logs))
+
+    def dense_moments_of(self, arrivals: Array, exposure: float) -> tuple[Array, Array]:
+        """Return the same from the probabilities of all codes."""
+        codes = np.arange(self.levels, dtype=float)
+        mean, variance = np.empty(len(arrivals)), np.empty(len(arrivals))
+        step = max(1, _TOGETHER // self.levels)
+        for start in range(0, len(arrivals), step):
+            some = slice(start, start + step)
+            nothing = np.zeros((len(arrivals[some]), self.levels), bool)
+            pmf = np.exp(self.log_pmf_of(arrivals[some], exposure, nothing))
+            mean[some] = pmf @ codes
+            variance[some] = np.sum(pmf * (codes - mean[some, None]) ** 2, axis=-1)
+        return mean, variance
 
     def log_likelihood(self, codes: Array, photons: Array, exposure: float) -> Array:
         """Return log P(code | photons) of each code, in the broadcast shape of the two."""
@@ -180,6 +224,8 @@ class Distribution(ABC):
 def check_exposure(exposure: float) -> None:
     if not (isfinite(exposure) and exposure > 0):
         raise ValueError(f"exposure is in seconds, finite and above 0, got {exposure!r}")
+    if not SHORTEST <= exposure <= LONGEST:
+        raise ValueError(f"exposure is {exposure:g} s; {SHORTEST:g} to {LONGEST:g} s can be computed with")
 
 
 def require_number(record: Any, name: str, low: float, high: float = np.inf, *, open_low: bool = False) -> None:
@@ -191,6 +237,15 @@ def require_number(record: Any, name: str, low: float, high: float = np.inf, *, 
         limits = "finite" if low == -np.inf else least if high == np.inf else f"{least} and at most {high:g}"
         raise ValueError(f"{type(record).__name__}.{name} is a number, {limits}; got {value!r}")
     object.__setattr__(record, name, float(value))
+
+
+def require_size(record: Any, name: str, least: float, most: float) -> None:
+    """Raise ValueError for a number that is neither 0 nor of a size that sums and powers of it can be computed with."""
+    value = getattr(record, name)
+    if value is not None and value != 0 and not least <= abs(value) <= most:
+        raise ValueError(
+            f"{type(record).__name__}.{name} is {value:g}; 0 and sizes from {least:g} to {most:g} can be computed with"
+        )
 
 
 def require_bits(record: Any) -> None:

@@ -15,6 +15,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.sensor import code_likelihood
 from qsim.sensor.distribution import Distribution
 
 _DECADES, _PER_DECADE = 8, 128  # of the grid: linear interpolation between its points is good to 4e-5
@@ -27,6 +28,8 @@ _TOGETHER = 1 << 22  # probabilities of a response held at a time
 _STEPS = 200  # of root finding; 10 are usual
 _HUGE = 1e300  # replaces infinity in root finding
 _CHUNK = 1 << 12  # different histograms at a time
+_TOO_DARK = "{}: dark counts alone exceed the light above which the mean code falls"
+_IMPOSSIBLE = "histogram{} contains code {}, which has probability 0 at every light level for {!r}"
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,7 @@ class _Grid:
 def _grid(sensor: Distribution, exposure: float) -> _Grid:
     end, brightest = sensor.white(exposure), sensor.brightest(exposure)
     if brightest <= 0:
-        raise ValueError(f"{type(sensor).__name__}: dark counts alone exceed the light above which the mean code falls")
+        raise ValueError(_TOO_DARK.format(type(sensor).__name__))
     dark = sensor.cdf(np.array([0.0]), exposure)
     for _ in range(_DOUBLINGS):
         if 2 * end >= brightest:
@@ -142,9 +145,7 @@ def response(sensor: Distribution, exposure: float, points: int = POINTS) -> Res
     sensor whose mean code does not rise.
     """
     photons = np.linspace(0, np.sqrt(_end_of_rise(sensor, exposure)), points) ** 2
-    parts = pieces(photons, sensor.levels)
-    mean = np.concatenate([sensor.mean(part, exposure) for part in parts])
-    variance = np.concatenate([sensor.variance(part, exposure) for part in parts])
+    mean, variance = sensor.moments(photons, exposure)
     rising = np.concatenate([[True], mean[1:] > np.maximum.accumulate(mean)[:-1]])
     return Response(photons[rising], mean[rising], variance[rising], sensor.levels - 1, str(sensor))
 
@@ -154,6 +155,8 @@ def maximum_likelihood(sensor: Distribution, histogram: Array, exposure: float, 
     counts = _checked(sensor, histogram)
     if not 0 < confidence < 1:
         raise ValueError(f"confidence is a probability above 0 and below 1, got {confidence!r}")
+    if sensor.many_codes:
+        return _one_by_one(sensor, counts, exposure, confidence)
     _refuse_impossible(sensor, exposure, counts)
     distinct, where = np.unique(counts.reshape(-1, sensor.levels), axis=0, return_inverse=True)
     grid, parts = _grid(sensor, exposure), []
@@ -161,6 +164,25 @@ def maximum_likelihood(sensor: Distribution, histogram: Array, exposure: float, 
         likelihood = _Likelihood(sensor, exposure, distinct[start : start + _CHUNK])
         parts.append(_estimate(likelihood, grid, confidence))
     found = np.concatenate(parts, axis=1)[:, where.ravel()] if parts else np.zeros((3, 0))
+    return Estimate(*found.reshape(3, *counts.shape[:-1]))
+
+
+def _one_by_one(sensor: Distribution, counts: Array, exposure: float, confidence: float) -> Estimate:
+    """Return the estimates of histograms of so many codes that only those that occur are looked at."""
+    if sensor.brightest(exposure) <= 0:
+        raise ValueError(_TOO_DARK.format(type(sensor).__name__))
+    rows = counts.reshape(-1, sensor.levels)
+    known: dict[bytes, tuple[float, float, float]] = {}
+    found = np.empty((3, len(rows)))
+    for i, row in enumerate(rows):
+        name = row.tobytes()
+        if name not in known:
+            try:
+                known[name] = code_likelihood.estimate(sensor, exposure, row, confidence)
+            except code_likelihood.Impossible as error:
+                at = [int(n) for n in np.unravel_index(i, counts.shape[:-1])]
+                raise ValueError(_IMPOSSIBLE.format(at or "", error.code, sensor)) from None
+        found[:, i] = known[name]
     return Estimate(*found.reshape(3, *counts.shape[:-1]))
 
 
@@ -181,9 +203,7 @@ def _refuse_impossible(sensor: Distribution, exposure: float, counts: Array) -> 
     impossible = (counts > 0) & (_grid(sensor, exposure).log_pmf <= _NEVER).all(axis=0)
     if impossible.any():
         *where, code = (int(i) for i in np.argwhere(impossible)[0])
-        raise ValueError(
-            f"histogram{where or ''} contains code {code}, which has probability 0 at every light level for {sensor!r}"
-        )
+        raise ValueError(_IMPOSSIBLE.format(where or "", code, sensor))
 
 
 @dataclass(frozen=True)

@@ -29,12 +29,15 @@ from math import floor, gamma
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.sensor import paralyzable_steps
+from qsim.sensor.counting_moments import LONGER, SIGMAS, summed
 from qsim.sensor.paralyzable_steps import LEAST
 from qsim.sensor.poisson import Mixture
 
 _BEYOND_TOP = 64  # codes above the top one that are summed term by term
 _LONGEST = 1 << 14  # arrivals in the longest table
 _MOST = 120  # counts in the alternating series; 120 counts where 3 are expected have a probability of 1e-142
+MANY = 256  # codes from which moments are closed forms
 _SPARSE = 3.0  # expected counts after the first up to which the alternating series keeps 13 digits
 
 
@@ -71,6 +74,41 @@ class Paralyzable:
             result[rows, : self.possible] = (
                 table.evaluate_slope(mean[rows]) if table else self._paralysed(mean[rows]).slope()
             )
+        return result
+
+    def moments(self, mean: Array) -> tuple[Array, Array]:
+        """Return mean and variance of the clipped count: [p] -> [p] each.
+
+        Of many codes they are 1! B_1 and 2! B_2 + B_1 - B_1^2 (`_moments`), or sums over the counts near the top code.
+        """
+        if not self.by_steps or self.possible < MANY:
+            law = self if self.possible == self.levels else Paralyzable(self.ratio, self.possible)
+            codes, nothing = np.arange(self.possible), np.zeros((len(mean), self.possible), bool)
+            pmf = np.exp(law.log_pmf(mean, nothing))
+            first = pmf @ codes
+            return first, np.sum(pmf * (codes - first[:, None]) ** 2, axis=1)
+        light = np.maximum(mean, 1e-12)
+        binomial, _ = _moments(light, 1 / self.ratio, 2)
+        first = binomial[:, 0]
+        second = 2 * binomial[:, 1] * light * np.exp(-light / self.ratio) + first - first**2
+        reach = SIGMAS * np.sqrt(np.maximum(second, 0)) + LONGER
+        clipped = first + reach >= self.possible - 1
+        if clipped.any():
+            first[clipped], second[clipped] = summed(
+                light[clipped], first[clipped], reach[clipped], self.possible - 1, self._tail
+            )
+        first[mean == 0], second[mean == 0] = 0.0, 0.0
+        return first, np.maximum(second, 0.0)
+
+    def _tail(self, codes: Array, mean: Array, below: Array) -> Array:
+        """Return P(N <= k) where `below`, else P(N > k), of pairs: codes int [n], means [n], bool [n] -> [n]."""
+        result = np.empty(len(codes))
+        for light in np.unique(mean):
+            for inside in (True, False):
+                some = np.flatnonzero((mean == light) & (below == inside))
+                nodes = paralyzable_steps.circle(np.array([light]), np.array([inside]), self.ratio)
+                sums = nodes.sums(codes[some], np.zeros(len(some), np.intp))
+                result[some] = sums if inside else -sums
         return result
 
     @property

@@ -19,11 +19,12 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.keys import Key, normal, uniform_pair, words
+from qsim.sensor import qis_codes, qis_moments
 from qsim.sensor.compiled.curves import by_pairs, falling
 from qsim.sensor.compiled.plan import MOST_BITS, Electrons, Plan
-from qsim.sensor.distribution import require_bits, require_number
+from qsim.sensor.distribution import MANY_BITS, MOST_EVENTS, require_bits, require_number, require_size
 from qsim.sensor.poisson import Mixture, poisson_quantile
-from qsim.sensor.qis_steps import Thresholds, decide
+from qsim.sensor.qis_steps import NOISY, BlurredSteps, Thresholds, decide
 from qsim.sensor.sensor import Sensor
 
 _REACH = 39.0  # sigmas: Phi(-39) = 1e-333 is 0 in float64
@@ -33,6 +34,14 @@ _LONGEST_TABLE = 2048  # electrons in a table that short sums are made of
 _BLUR = 8.3  # sigmas: 1 - Phi(8.3) = 5e-17 is negligible beside 1
 _FARTHEST = 1e15  # electrons; no light reaches further
 _WIDEST = 1 << 22  # numbers in all thresholds of a sensor
+_SIZES = {  # of numbers that are not 0
+    "quantum_efficiency": (1e-12, 1.0),
+    "dark_current": (1e-30, MOST_EVENTS),
+    "read_noise": (1e-6, 1e9),
+    "gain": (1e-9, 1e9),
+    "offset": (1e-12, 1e12),
+    "full_well": (1e-6, MOST_EVENTS),
+}
 _PROCESS_BITS = 8  # above, codes are drawn step by step instead of through their cdf
 
 
@@ -59,6 +68,8 @@ class QIS(Sensor):
         require_number(self, "offset", -inf)
         if self.full_well is not None:
             require_number(self, "full_well", 0, open_low=True)
+        for name, (least, most) in _SIZES.items():
+            require_size(self, name, least, most)
 
     @property
     def efficiency(self) -> float:
@@ -86,6 +97,28 @@ class QIS(Sensor):
 
     def slope_of(self, arrivals: Array, exposure: float) -> Array:
         return np.concatenate([t.evaluate_slope(arrivals) for _, t in self._tables()], axis=1)
+
+    @property
+    def many_codes(self) -> bool:
+        return self.bits >= MANY_BITS or table_length(self) > _LONGEST_TABLE
+
+    def moments_of(self, arrivals: Array, exposure: float) -> tuple[Array, Array]:
+        if not self.many_codes:
+            return self.dense_moments_of(arrivals, exposure)
+        return qis_moments.moments(self, arrivals)
+
+    def code_laws(self, codes: Array, arrivals: float, exposure: float) -> tuple[Array, Array]:
+        chain, found = qis_moments.Chain.of(self), []
+        for code in codes.tolist():
+
+            def chance(electrons: Array, code: int = code) -> Array:
+                electrons = electrons if self.full_well is None else np.minimum(electrons, self.full_well)
+                z = _normal_thresholds(self, electrons, np.array([code - 1, code]))
+                return log_normal_difference(z[:, 0], z[:, 1])
+
+            found.append(qis_codes.code_law(chain, code, arrivals, chance))
+        logs, slopes = np.array(found).reshape(-1, 2).T
+        return logs, slopes
 
     def _tables(self) -> Iterator[tuple[slice, Mixture]]:
         """Yield some codes and their table, so few that a table stays below 20 MB.
@@ -125,12 +158,19 @@ class QIS(Sensor):
         dark, count = self.dark_rate * exposure, self.levels - 1
         if (sums := self.short_sums()) is not None:
             return Plan.summed(self.efficiency, dark, sums)
-        steps = thresholds(self)
+        steps: Thresholds | BlurredSteps | None = self._blurred_steps() or thresholds(self)
         if steps is None:
             return None
         return Plan.looked_up(
             self.efficiency, dark, falling(by_pairs(steps.cdf, count), by_pairs(steps.slope, count), count)
         )
+
+    def _blurred_steps(self) -> BlurredSteps | None:
+        """Return the steps of strong read noise; None for less, and where the full well is in reach."""
+        places = (np.arange(self.levels - 1) + 0.5 - self.offset) / self.gain
+        if self.read_noise < NOISY or (self.full_well or inf) < places[-1] + _BLUR * self.read_noise:
+            return None
+        return BlurredSteps(places, self.read_noise)
 
     def short_sums(self) -> Electrons | None:
         """Return the steps of at most 8 bits as sums over electrons; None if they are too long."""

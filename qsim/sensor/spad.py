@@ -14,7 +14,7 @@ from numpy import ndarray as Array
 
 from qsim.keys import Key, normal, require_counters, uniform_pair, words
 from qsim.sensor.compiled.plan import MOST_BITS, Live, Plan
-from qsim.sensor.distribution import require_bits, require_number
+from qsim.sensor.distribution import MOST_EVENTS, require_bits, require_number, require_size
 from qsim.sensor.qis_steps import search
 from qsim.sensor.sensor import Sensor
 
@@ -33,6 +33,8 @@ class SPAD(Sensor):
         require_number(self, "pde", 0, 1, open_low=True)
         require_number(self, "dark_count_rate", 0)
         require_bits(self)
+        require_size(self, "pde", 1e-12, 1.0)
+        require_size(self, "dark_count_rate", 1e-30, MOST_EVENTS)
 
     @property
     def efficiency(self) -> float:
@@ -88,6 +90,21 @@ class BinarySPAD(SPAD):
 
         k, per_plane = np.arange(self.levels), arrivals[:, None] / self.planes
         return _log_binomials(self.planes) + xlogy(k, -np.expm1(-per_plane)) - (self.planes - k) * per_plane
+
+    def code_laws(self, codes: Array, arrivals: float, exposure: float) -> tuple[Array, Array]:
+        from scipy.special import gammaln
+
+        m, per_plane = self.planes, arrivals / self.planes
+        ways = gammaln(m + 1) - gammaln(codes + 1) - gammaln(m - codes + 1)
+        logs = ways + codes * np.log(-np.expm1(-per_plane)) - (m - codes) * per_plane
+        return logs, (codes / np.expm1(per_plane) - (m - codes)) / m
+
+    def moments_of(self, arrivals: Array, exposure: float) -> tuple[Array, Array]:
+        if not self.many_codes:
+            return self.dense_moments_of(arrivals, exposure)
+        per_plane = arrivals / self.planes
+        mean = -self.planes * np.expm1(-per_plane)
+        return mean, mean * np.exp(-per_plane)
 
     def slope_of(self, arrivals: Array, exposure: float) -> Array:
         """Return dF_k/dp dp/darrivals: -M C(M-1, k) p^k (1-p)^(M-1-k) times (1-p) / M."""

@@ -23,7 +23,7 @@ from numpy import ndarray as Array
 
 from qsim.arrays import plain
 from qsim.keys import Key, require_counters, uniform, uniform_pair, words
-from qsim.sensor.distribution import check_exposure, require_number
+from qsim.sensor.distribution import MOST_EVENTS, check_exposure, require_number, require_size
 from qsim.sensor.poisson import poisson_log_pmf, poisson_quantile
 from qsim.sensor.sensor import Sensor
 
@@ -48,6 +48,8 @@ class SpikeCamera(Sensor):
     def __post_init__(self) -> None:
         require_number(self, "quantum_efficiency", 0, 1, open_low=True)
         require_number(self, "dark_current", 0)
+        require_size(self, "quantum_efficiency", 1e-12, 1.0)
+        require_size(self, "dark_current", 1e-30, MOST_EVENTS)
         if type(self.threshold) is not int or not 1 <= self.threshold <= MOST:
             raise ValueError(
                 f"SpikeCamera.threshold is a whole number of electrons, 1 ... {MOST}; got {self.threshold!r}"

@@ -12,6 +12,9 @@ dark counts and of reading would on average be light.
 
 Where codes tell nothing (below a high threshold, at saturation) phi stands still while light grows: `slope` is large.
 
+Of many codes (`Sensor.many_codes`) the mean code keeps nearly all information, and I is that of the mean code,
+(dmu/dlight)^2 / V.
+
 Source: the root of the information as a stabiliser of variance is Fisher's; the tables are ours, from the exact law.
 """
 
@@ -64,12 +67,15 @@ def information_domain(sensor: Sensor, exposure: float) -> InformationDomain:
     """
     table = sensor.response(exposure)
     root = np.sqrt(table.photons)
-    middle = ((root[1:] + root[:-1]) / 2) ** 2
-    parts = pieces(middle, sensor.levels)
-    information = np.concatenate([sensor.fisher_information(part, exposure) for part in parts])
-    # d light = 2 sqrt(light) d sqrt(light): the integrand stays finite at 0, where I may not
-    steps = np.maximum(2 * np.sqrt(information * middle) * np.diff(root), LEAST)
     variance = (table.variance[1:] + table.variance[:-1]) / 2
+    if sensor.many_codes:
+        steps = np.maximum(np.diff(table.mean) / np.sqrt(np.maximum(variance, FLOOR)), LEAST)
+    else:
+        middle = ((root[1:] + root[:-1]) / 2) ** 2
+        parts = pieces(middle, sensor.levels)
+        information = np.concatenate([sensor.fisher_information(part, exposure) for part in parts])
+        # d light = 2 sqrt(light) d sqrt(light): the integrand stays finite at 0, where I may not
+        steps = np.maximum(2 * np.sqrt(information * middle) * np.diff(root), LEAST)
     with np.errstate(over="ignore"):
         deviation = np.where(variance > FLOOR, np.sqrt(variance) * steps / np.diff(table.mean), 1.0)
     return InformationDomain(

@@ -30,6 +30,7 @@ from qsim.sensor.sensor import Sensor
 Kind = Literal["table", "binomial", "poisson"]
 
 FLOOR = 1e-3  # of the variance in the integral [codes^2]: keeps f finite where every code is the top one
+NODES = 16  # of the normal law of a mean of many codes
 POINTS = 1500  # of the table of D; each needs the distribution of a sum
 
 
@@ -113,11 +114,18 @@ def stabiliser(sensor: Sensor, exposure: float, times: tuple[int, ...], kind: Ki
         case _:
             raise ValueError(f"stabiliser is table, binomial or poisson, got {kind!r}")
     photons = np.linspace(0, np.sqrt(table.cap(samples)), POINTS) ** 2
-    lattice = np.interp(np.arange(samples * top + 1) / samples, mean_code, stabilised)
-    expected = np.concatenate(
-        [sum_pmf(np.exp(sensor.log_pmf(part, exposure)), times) @ lattice for part in pieces(photons, len(lattice))]
-    )
+    excess = (sum(count * count for count in times) / samples) ** 0.5
+    if sensor.many_codes:  # their mean is nearly normal
+        nodes, weights = np.polynomial.hermite_e.hermegauss(NODES)
+        mean, variance = sensor.moments(photons, exposure)
+        deviation = np.sqrt(variance / samples) * excess
+        spread = np.interp(mean[:, None] + nodes * deviation[:, None], mean_code, stabilised)
+        expected = spread @ (weights / weights.sum())
+    else:
+        lattice = np.interp(np.arange(samples * top + 1) / samples, mean_code, stabilised)
+        expected = np.concatenate(
+            [sum_pmf(np.exp(sensor.log_pmf(part, exposure)), times) @ lattice for part in pieces(photons, len(lattice))]
+        )
     expected = np.maximum.accumulate(expected)
     rising = np.concatenate([[True], np.diff(expected) > 0])
-    excess = (sum(count * count for count in times) / samples) ** 0.5
     return Stabiliser(samples, mean_code, stabilised, photons[rising], expected[rising], excess)

@@ -7,6 +7,9 @@ import pytest
 from sensor_cases import EXPOSURE, SENSORS, each
 from stats import critical_z
 
+from qsim.keys import Key
+from qsim.sensor import code_likelihood
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
@@ -88,6 +91,44 @@ def test_histograms_without_answer_are_named():
     message = r"^histogram\[0, 0\] contains code 1, which has probability 0 at every light level for QIS\("
     with pytest.raises(ValueError, match=message):
         sensor.maximum_likelihood(counts, EXPOSURE)  # gain 2 without read noise: codes are even
+
+
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(s, marks=pytest.mark.slow) for s in range(2, 30))])
+def test_the_codes_that_occur_give_the_estimates_of_all_codes(seed):
+    """Estimates of many codes look only at those that occur; for few codes both ways can be compared."""
+    rng = np.random.default_rng(seed)
+    for _ in range(6):
+        bits, gain = int(rng.integers(2, 8)), 10 ** rng.uniform(-1, 1)
+        noise, offset = float(rng.choice([0.0, 0.2, 3.0])), float(rng.choice([0.0, 3.3]))
+        well = None if rng.random() < 0.6 else float(rng.uniform(0.3, 1.5) * 2**bits / gain)
+        dead = float(rng.choice([0.0, 1e-6, 3e-5]))
+        sensors = (
+            QIS(0.8, 100.0, noise, bits, gain=gain, offset=offset, full_well=well),
+            BinarySPAD(0.4, 100.0, bits),
+            CountingSPAD(0.5, 100.0, dead, bits),
+        )
+        for sensor in sensors:
+            light = 10 ** rng.uniform(-2, np.log10(1.3 * sensor.white(EXPOSURE)))
+            histogram = rng.multinomial(int(rng.integers(1, 30)), sensor.pmf(light, EXPOSURE)).astype(float)
+            expected = sensor.maximum_likelihood(histogram, EXPOSURE)
+            found = code_likelihood.estimate(sensor, EXPOSURE, histogram, 0.95)
+            np.testing.assert_allclose(found, [expected.photons, expected.lower, expected.upper], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("bits", [9, 12, 16])
+def test_estimates_of_many_codes(bits):
+    """The mean of codes that are not clipped is nearly sufficient; saturated and impossible codes are named."""
+    sensor = QIS(0.8, 0.0, 3.0, bits, gain=0.5, offset=20.0)
+    light = 0.5 * sensor.white(EXPOSURE)
+    codes = sensor.sample(np.full((1, 50), light), EXPOSURE, key=Key(1, 2), engine="reference").ravel()
+    found = sensor.maximum_likelihood(np.bincount(codes, minlength=sensor.levels), EXPOSURE)
+    moment = sensor.response(EXPOSURE).invert(codes.mean(), 50)
+    assert found.photons == pytest.approx(moment, abs=0.2 * np.sqrt(light / 50))
+    assert found.lower < found.photons < found.upper
+    top = sensor.maximum_likelihood(np.eye(sensor.levels)[-1], EXPOSURE)
+    assert 0 < top.lower < top.photons < np.inf == top.upper
+    with pytest.raises(ValueError, match=r"^histogram contains code 1, which has probability 0 at every light level"):
+        QIS(0.8, 0.0, 0.0, bits, gain=2.0).maximum_likelihood(np.eye(1 << bits)[1], EXPOSURE)
 
 
 # ---- Response
