@@ -315,9 +315,17 @@ def _tail(z: Array, blur: float) -> tuple[Array, Array]:
     from scipy.special import ndtr
 
     tail, density = ndtr(-z), np.exp(-z * z / 2) / np.sqrt(2 * pi)
-    hermite = (1.0, z, z**2 - 1, z**3 - 3 * z, z**4 - 6 * z**2 + 3, z**5 - 10 * z**3 + 15 * z)
-    hermite = (*hermite, z**6 - 15 * z**4 + 45 * z**2 - 15, z**7 - 21 * z**5 + 105 * z**3 - 105 * z)
-    hermite = (*hermite, z**8 - 28 * z**6 + 210 * z**4 - 420 * z**2 + 105)
+    hermite: list[Array] = [
+        np.ones(len(z)),
+        z,
+        z**2 - 1,
+        z**3 - 3 * z,
+        z**4 - 6 * z**2 + 3,
+        z**5 - 10 * z**3 + 15 * z,
+        z**6 - 15 * z**4 + 45 * z**2 - 15,
+        z**7 - 21 * z**5 + 105 * z**3 - 105 * z,
+        z**8 - 28 * z**6 + 210 * z**4 - 420 * z**2 + 105,
+    ]
     slopes = [tail, *((-1) ** (r + 1) * h * density / blur ** (r + 1) for r, h in enumerate(hermite))]
     first = blur * (density - z * tail)
     second = blur**2 * ((1 + z * z) * tail - z * density)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from qsim.sensor import qis_moments
+from qsim.sensor import paralyzable, qis_moments
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.poisson import poisson_log_pmf
 from qsim.sensor.qis import QIS
@@ -85,13 +85,14 @@ def test_random_counters_have_the_moments_of_their_tables(seed):
             assert_equal_moments(sensor, sensor.moments_of(light, 1.0), sensor.dense_moments_of(light, 1.0))
 
 
-@pytest.mark.parametrize("bits", [8, 9])
-def test_paralyzable_counters_have_the_moments_of_their_tables(bits):
-    """Dense tables take up to 16384 arrivals; of 8 bits and many dead times the rising branch is clipped."""
-    for dead in (1 / 1200, 1 / 500, 1 / 60):
-        sensor = CountingSPAD(0.5, 10.0, dead, bits, paralyzable=True)
-        light = np.array([0.0, 0.01, 3.0, 40.0, 200.0, 330.0, 0.9 / dead])
-        assert_equal_moments(sensor, sensor.moments_of(light, 1.0), sensor.dense_moments_of(light, 1.0))
+@pytest.mark.parametrize("bits", [4, 8])
+def test_paralyzable_counters_have_the_moments_of_their_tables(bits, monkeypatch):
+    """In 60 dead times up to 22 counts are expected: 4 bits are clipped, 8 are not. More take long tables."""
+    sensor = CountingSPAD(0.5, 10.0, 1 / 60, bits, paralyzable=True)
+    light = np.array([0.0, 0.01, 3.0, 15.0, 25.0, 54.0])
+    dense = sensor.dense_moments_of(light, 1.0)
+    monkeypatch.setattr(paralyzable, "MANY", 2)
+    assert_equal_moments(sensor, sensor.moments_of(light, 1.0), dense)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
