@@ -21,15 +21,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import ceil, inf, pi
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.sensor.poisson import poisson_log_pmf
-
-if TYPE_CHECKING:
-    from qsim.sensor.qis import QIS
 
 SIGMAS = 8.6  # beyond them, 1e-17 of a normal law is left out
 LONGER = 45.0  # electrons by which the upper tail of a dim Poisson law is longer
@@ -44,6 +41,21 @@ WIDE = 8.0  # codes of read noise from which sums over codes are integrals with 
 TABLED = 4e6  # electrons up to which log n! rounds to 4e-9, which the mean over thousands of terms reduces
 
 
+class Converter(Protocol):
+    """The parameters of a QIS behind the photodiode."""
+
+    @property
+    def gain(self) -> float: ...
+    @property
+    def offset(self) -> float: ...
+    @property
+    def read_noise(self) -> float: ...
+    @property
+    def full_well(self) -> float | None: ...
+    @property
+    def levels(self) -> int: ...
+
+
 @dataclass(frozen=True)
 class Chain:
     """The numbers of a QIS behind the photodiode."""
@@ -55,7 +67,7 @@ class Chain:
     top: int
 
     @classmethod
-    def of(cls, sensor: QIS) -> Chain:
+    def of(cls, sensor: Converter) -> Chain:
         well = inf if sensor.full_well is None else sensor.full_well
         return cls(sensor.gain, sensor.offset, sensor.read_noise, well, sensor.levels - 1)
 
@@ -69,7 +81,7 @@ class Chain:
         return self.gain * np.minimum(electrons, self.well) + self.offset
 
 
-def moments(sensor: QIS, mean: Array) -> tuple[Array, Array]:
+def moments(sensor: Converter, mean: Array) -> tuple[Array, Array]:
     """Return mean and variance of the code: expected electrons [p] -> [p] each."""
     chain = Chain.of(sensor)
     least, most = window(mean)
