@@ -27,7 +27,7 @@ from qsim.cli.options import refuse_empty
 from qsim.files import FULL, Progress, wording
 from qsim.process import peak_memory
 from qsim.scratch import sweep
-from qsim.terminal import tolerant_output
+from qsim.terminal import printable, tolerant_output
 
 SHOWN_AFTER = 2.0  # s, before a progress bar appears
 PILOT = "pilot and compilation of kernels"  # before the first frame of a renderer
@@ -268,7 +268,7 @@ def _then(args: argparse.Namespace) -> str:
 
 def failed(text: str, code: int, as_json: bool) -> int:
     """Print why a command failed, with --json also as an object on stdout; return its exit code."""
-    print(text, file=sys.stderr)
+    print(printable(text), file=sys.stderr)
     if as_json:
         print(json.dumps({"error": text.strip(), "exit_code": code}, sort_keys=True))
     return code
@@ -289,7 +289,7 @@ def _warnings_as_lines(prog: str) -> Iterator[None]:
 def note(text: str) -> None:
     """Print a line on stderr, unless the command runs with --quiet."""
     if not quiet.get():
-        print(text, file=sys.stderr)
+        print(printable(text), file=sys.stderr)
 
 
 def one_line(error: BaseException) -> str:
@@ -313,7 +313,7 @@ def output(args: argparse.Namespace, found: dict[str, Any], text: str | Sequence
     if args.json:
         print(json.dumps(found, sort_keys=True))
     else:
-        print(text if isinstance(text, str) else "\n".join(text))
+        print(printable(text if isinstance(text, str) else "\n".join(text)))
 
 
 def refuse_idle(args: argparse.Namespace, where: str, names: Sequence[str]) -> None:
@@ -345,6 +345,7 @@ def bar(label: str, unit: str = "frame", first: str = "") -> Iterator[Progress]:
     """
     from tqdm import tqdm
 
+    label = printable(label)
     interval, silent = 0.2 if sys.stderr.isatty() else 10.0, quiet.get()
     options = {"unit": unit, "delay": SHOWN_AFTER, "mininterval": interval, "dynamic_ncols": True, "disable": silent}
     with tqdm(desc=label, file=sys.stderr, **options) as shown:

@@ -35,8 +35,14 @@ class ClipFolder:
     """A complete clip folder; frames are read on demand."""
 
     path: Path
-    meta: dict[str, Any]  # clip.json
+    meta: dict[str, Any] = None  # type: ignore[assignment]  # clip.json, which `open` reads
     keeps: object = field(default=None, repr=False)  # a temporary folder: it lasts as long as a reference to it
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` where the name of a folder stands alone: `open` reads its description."""
+        if not isinstance(self.path, Path) or not isinstance(self.meta, dict):
+            kind = type(self).__name__
+            raise ValueError(f"{kind}: a clip folder is opened by {kind}.open({str(self.path)!r})")
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Self:

@@ -92,8 +92,12 @@ class Sensing:
 
     @property
     def depth(self) -> int | None:
-        """The bits of a code, as requested or of a record; None: the device's own."""
-        return self.sensor.bits if self.bits is None and isinstance(self.sensor, Sensor) else self.bits
+        """The bits of a code, as requested, of a record, or of the file of a sum of planes; None: the device's own."""
+        if self.bits is not None:
+            return self.bits
+        if isinstance(self.sensor, Sensor):
+            return self.sensor.bits
+        return devices.load(self.sensor, ppp=1.0).bits if self.group and self.sensor.endswith(".toml") else None
 
 
 def prepare(clip: ClipFolder, sensing: Sensing) -> Draw:
@@ -261,6 +265,8 @@ def sense(
     A stream of this name is kept if its settings are the same; `FileExistsError` for other settings without `force`.
     While another process senses this clip, wait after a call of `on_wait`.
     """
+    if isinstance(sensing.sensor, Sensor):
+        devices.check_known(sensing.sensor)
     draw, missed = followed(clip, sensing, prepare(clip, sensing))
     meta = describe(clip, sensing, draw)
     efficiency = draw.sensor.efficiency

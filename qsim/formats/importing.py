@@ -36,11 +36,14 @@ from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 
 
-def read(path: Path, hints: Hints | None = None, *, compared: tuple[str, ...] = ()) -> Recording:
+def read(path: Path | str, hints: Hints | None = None, *, compared: tuple[str, ...] = ()) -> Recording:
     """Open a foreign file or folder; frames are read on demand.
 
     `ValueError` for a hint without effect on this file, except those that the caller `compared` with it.
     """
+    if not isinstance(path, str | Path):
+        raise ValueError(f"path is the name of a file or folder, got {path!r:.60}")
+    path = Path(path)
     hints = hints or Hints()
     layout = hints.layout or detect(path, hints)
     if layout not in LAYOUTS:

@@ -252,14 +252,17 @@ def load(
         raise ValueError(
             f"unknown sensor {str(name)!r}{suggest(str(name), DEVICES)}; `qsim doctor --devices` lists all"
         )
-    sensor = from_toml(path)
+    sensor = from_toml(path, bits)
     if bits is not None and bits != sensor.bits:
         raise ValueError(f"{path}: the file has bits = {sensor.bits}, the request {bits}; change one of them")
     return sensor
 
 
-def from_toml(path: str | Path) -> Sensor:
-    """Return the sensor of a TOML file with a table [sensor] and, optionally, [sources] and [defects]; strict."""
+def from_toml(path: str | Path, bits: int | None = None) -> Sensor:
+    """Return the sensor of a TOML file with a table [sensor] and, optionally, [sources] and [defects]; strict.
+
+    `bits` is the depth of a code where the file states none: such a file serves every depth.
+    """
     path = Path(path)
     tables = files.read_toml(path, "sensor file")
     for key in tables:
@@ -267,6 +270,10 @@ def from_toml(path: str | Path) -> Sensor:
             raise ValueError(f"{path}: unknown table [{key}]{suggest(key, TABLES)}")
     if not isinstance(tables.get("sensor"), dict):
         raise ValueError(f"{path}: a table [sensor] with model, bits and the model's fields is missing")
+    if "bits" not in tables["sensor"]:
+        if bits is None:
+            raise ValueError(f"{path}: states no bits, so it serves every depth; say which one, as in --bits 3")
+        tables["sensor"]["bits"] = bits
     sensor = from_dict(_with_gain(tables["sensor"], f"{path}: [sensor]"), where=f"{path}: [sensor]")
     known = [field.name for field in fields(sensor)]  # type: ignore[arg-type]  # every model is a dataclass
     known += ["iso"] if "iso" in tables["sensor"] else []
@@ -283,8 +290,6 @@ def _with_gain(settings: dict[str, object], where: str) -> dict[str, object]:
     """
     if "iso" not in settings:
         return settings
-    if "bits" not in settings:
-        raise ValueError(f"{where}: bits is missing; iso states the gain of a code of so many bits")
     numbers = {}
     for key in ("iso", "full_well", "bits", "offset"):
         value = settings.get(key, 0.0)
@@ -311,6 +316,20 @@ def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:
         raise ValueError(f"{where}: model is one of {', '.join(MODELS)}, got {name!r}{suggest(str(name), MODELS)}")
     values = {key: value for key, value in settings.items() if key != "model"}
     return make(MODELS[name], values, where)
+
+
+def is_known(sensor: Sensor) -> bool:
+    """Return whether a sensor is of a model of this package, which a file can name."""
+    return MODELS.get(type(sensor).__name__) is type(sensor)
+
+
+def check_known(sensor: Sensor) -> None:
+    """Raise `ValueError` unless a file can state this sensor: of a class of one's own no reader could make it again."""
+    if not is_known(sensor):
+        raise ValueError(
+            f"{type(sensor).__name__}: is none of the models that a file can name ({', '.join(MODELS)}), so a stored "
+            "stream of it could not be opened; draw its codes by its method `sample` and keep the array"
+        )
 
 
 def listing() -> list[dict[str, object]]:

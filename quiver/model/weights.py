@@ -45,6 +45,8 @@ def read_torch(path: Path, device: torch.device | str = "cpu") -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # about pickle dialects, which end in the error below
             return torch.load(path, map_location=device, weights_only=True)
+    except pickle.UnpicklingError:  # torch advises to trust the file, with escapes of the terminal
+        raise ValueError("it holds pickled objects beside tensors and plain values") from None
     except DAMAGE as error:
         raise ValueError(short_reason(error)) from None
 

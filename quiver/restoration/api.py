@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.sensor import devices
 from quiver.data.clips import Clip
 from quiver.data.codes import Codes, LazyArray, Sensor, Stream, array_codes, filled, open_stream, sensed, stream_codes
 from quiver.data.defects import check_map
@@ -66,7 +67,17 @@ def restore(
     for text in found:
         warnings.warn(text, stacklevel=2)
     restored = runner.restore(codes)
-    check_finite(restored, runner.name)
+    try:
+        check_finite(restored, runner.name)
+    except ValueError as error:
+        if devices.is_known(codes.sensor):
+            raise
+        own = type(codes.sensor).__name__
+        what = str(error).partition(";")[0]
+        raise ValueError(
+            f"{what}; its sensor is a {own}, of no model of this package: check its cdf_of, log_pmf_of and slope_of, "
+            "or use a classical method, as in method='moment'"
+        ) from None
     return restored
 
 

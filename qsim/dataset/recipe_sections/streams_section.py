@@ -82,8 +82,9 @@ def _sensor(section: Section, sensor: str, bits: list[int | None], group: bool, 
     for depth in bits:
         with section.naming("sensor"):
             found = devices.load(sensor, ppp=3.25, bits=depth, exposure=5e-4)
-        if group and not (depth and isinstance(found, BinarySPAD)):
-            what = f"this is a {type(found).__name__}" if depth else "the bits of a code are needed, as in bits = 3"
+        known = depth is not None or sensor.endswith(".toml")
+        if group and not (known and isinstance(found, BinarySPAD)):
+            what = f"this is a {type(found).__name__}" if known else "the bits of a code are needed, as in bits = 3"
             raise ValueError(f"{section.where('group')}: group sums planes of a clocked SPAD; {what}")
         if slices > 1 and (group or not isinstance(found, QIS | CountingSPAD)):
             what = "group sums planes instead" if group else f"this is a {type(found).__name__}"

@@ -215,7 +215,7 @@ def test_iso_is_a_gain_at_which_a_share_of_the_full_well_fills_the_code(tmp_path
         ("iso = 100", "iso = true", "iso is a number, got True"),
         ("iso = 100", "iso = 100\ngain = 1.0", "leave one of iso and gain out"),
         ('"QIS"', '"SpikeCamera"', "iso states the gain of a QIS"),
-        ("bits = 12\n", "", "bits is missing; iso states the gain of a code of so many bits"),
+        ("bits = 12\n", "", "states no bits, so it serves every depth; say which one"),
         ("full_well = 8000.0\n", "", "iso needs a full_well above 0"),
         ("offset = 0.0", "offset = 5000.0", "codes above the offset"),
         ("bits = 12", "bits = 99999999999", "bits"),
@@ -228,3 +228,12 @@ def test_an_iso_that_states_no_gain_is_refused(tmp_path, old, new, message):
     with pytest.raises(ValueError, match=message) as caught:
         load(tmp_path / "c.toml")
     assert "\n" not in str(caught.value)
+
+
+def test_a_file_without_bits_serves_every_depth(tmp_path):
+    path = tmp_path / "camera.toml"
+    path.write_text('[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 20\n')
+    for bits in (1, 3, 8):
+        assert load(path, bits=bits) == BinarySPAD(0.4, 20.0, bits)
+    with pytest.raises(ValueError, match=r"camera\.toml: states no bits, so it serves every depth; say which one"):
+        load(path)
