@@ -178,11 +178,11 @@ def to_toml(found: Calibration, title: str, stem: str = "") -> str:
     """Return the sensor as a device file, each number with its interval and method as its source.
 
     The maps of file names that begin with `stem` are in comments, because they fit only frames that are not larger. The
-    file of a binary SPAD states no bits: sums of planes have any.
+    file of a SPAD states no bits: its pixels are the same at every depth of a code.
     """
     lines = [f"# {title}", "[sensor]"]
     described = sensor_of(found).to_dict()
-    if found.model == "BinarySPAD":
+    if found.model != "QIS":
         described.pop("bits")
     lines += [f"{key} = {_toml(value)}" for key, value in described.items() if value is not None]
     lines += ["", "[sources]"]

@@ -21,7 +21,7 @@ def test_files_of_a_calibration_load_as_a_device(tmp_path):
     path = tmp_path / "mine.toml"
     written = write(found, path, "a test")
     assert {p.name for p in written} == {"mine.toml", "mine.json", "mine.png", "mine_dark.npy", "mine_hot.npy"}
-    loaded = devices.load(path)
+    loaded = devices.load(path, bits=found.bits)
     assert loaded == sensor_of(found)
     assert "bits" not in path.read_text()
     assert np.load(tmp_path / "mine_dark.npy").shape == (24, 24)
