@@ -91,15 +91,18 @@ def test_ignored_dead_time_is_flagged_and_the_right_model_is_not():
 
 
 def test_real_dark_counts():
-    """50 x 50 SPADs, 7650 planes of 10.3 us: median 127 counts/s, 1.0 % of the pixels above ten medians."""
+    """50 x 50 SPADs, 7650 planes of 10.3 us: 1.0 % of the pixels above ten medians.
+
+    Pixels below three medians have 9.68 counts in the mean, 123 /s; the median of all counts is 10, or 127 /s, because
+    counts are whole numbers.
+    """
     path = Path(__file__).parents[4] / "shared" / "data" / "spad512_darkcounts_YX.npy"
     if not path.exists():
         pytest.skip(f"{path.name} is not part of this repository")
     ones = np.rint(-np.expm1(-np.load(path)) * 7650)
     found = calibrate_spad([measure_sums([ones], planes=7650, exposure=10.3e-6, photons=0.0)], [], bits=1)
     median = found.values["dark_count_rate_median"]
-    assert median.low < 127 < median.high
-    assert median.high - median.low < 6
+    assert 115 < median.low < median.value < median.high < 127
     assert 20 < found.values["hot_pixels"].value < 30
     named = {words for warning in found.warnings for words in warning.split(", ")}
     assert "p10" in named  # of 9 counts
