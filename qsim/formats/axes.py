@@ -58,7 +58,8 @@ def named(path: Path, sizes: tuple[int, ...], hints: Hints, stated: str | None =
     `ValueError` names the axes of which one index must be chosen.
     """
     given = hints.axes
-    axes = _checked(path, given, sizes) if given is not None else stated or ("TYX" if len(sizes) == 3 else None)
+    unasked = "TYX" if stated is None and len(sizes) == 3 else _distinct(stated)
+    axes = unasked if given is None else _checked(path, given, sizes)
     if axes is None:
         raise ValueError(
             f"{path}: expected frames [T, H, W], found an array of shape {list(sizes)}; name its axes, as in --axes "
@@ -83,6 +84,17 @@ def named(path: Path, sizes: tuple[int, ...], hints: Hints, stated: str | None =
     chosen = "".join(f"; {PICKED[letter]} {n} of {sizes_of[letter]}" for letter, n in picks.items())
     as_time = f"; {time} is time" if time not in (None, "T") else ""
     return Reading(index, order, time is not None, "S" in kept, f"read as {sizes_said} of axes {axes}{as_time}{chosen}")
+
+
+def _distinct(stated: str | None) -> str | None:
+    """Return stated names with a letter of its own for each axis: tifffile calls all unknown ones Q."""
+    if stated is None:
+        return None
+    found = ""
+    for letter in stated:
+        free = [other for other in "QRABDEFGHJKLMNOPUVW" if other not in stated + found]
+        found += letter if letter not in found else free[0]
+    return found
 
 
 def _checked(path: Path, given: str, sizes: tuple[int, ...]) -> str:

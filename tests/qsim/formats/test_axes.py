@@ -60,6 +60,18 @@ def test_channels_and_slices_of_a_tiff_are_no_frames(tmp_path: Path, axes: str, 
     np.testing.assert_array_equal(everything(path, bits=12, **picks), expected)
 
 
+def test_axes_without_names_are_named_by_the_user(tmp_path: Path):
+    import tifffile
+
+    stored = random_frames("TCYX")
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric="minisblack")
+    with pytest.raises(
+        ValueError, match=r"axes Q=3, R=4, Y=5, X=6: frames have one axis .*; name the axis of the frames"
+    ):
+        importing.read(tmp_path / "a.tif", Hints(bits=12))
+    np.testing.assert_array_equal(everything(tmp_path / "a.tif", axes="TCYX", channel=1, bits=12), stored[:, 1])
+
+
 def test_axes_that_do_not_fit_are_refused(tmp_path: Path):
     np.save(tmp_path / "a.npy", np.zeros((2, 3, 4, 5), np.float32))
     for hints, message in (
