@@ -24,11 +24,12 @@ MOST_REACH = 5  # px
 _FLAT = 1e4  # variance of each band's mean over that of the picture
 
 
-def demosaic(mosaic: Array, filters: ColourFilter, efficiency: float) -> Array:
+def demosaic(mosaic: Array, filters: ColourFilter, efficiency: float, *, floor: bool = True) -> Array:
     """Return photons of R, G and B, float64 [..., 3, H, W], of the light [..., H, W] that `filters.mosaic` makes.
 
-    `efficiency` is that of the sensor. Values are cut off at 0. `ValueError` for frames smaller than the tile, and for
-    masks whose colours do not determine three bands.
+    `efficiency` is that of the sensor. With `floor` values are cut off at 0, as for a picture; without it noise in dim
+    bands adds no light. `ValueError` for frames smaller than the tile, and for masks whose colours do not determine
+    three bands.
     """
     height, width = mosaic.shape[-2:]
     rows, columns = filters.tile
@@ -47,7 +48,7 @@ def demosaic(mosaic: Array, filters: ColourFilter, efficiency: float) -> Array:
         place = windows[..., i:height:rows, j:width:columns, :, :]
         found = np.tensordot(place, kernels[i, j], axes=((-2, -1), (-2, -1)))
         out[..., i::rows, j::columns] = np.moveaxis(found, -1, -3)
-    return np.maximum(out, 0)
+    return np.maximum(out, 0) if floor else out
 
 
 def determines_bands(filters: ColourFilter, efficiency: float) -> bool:

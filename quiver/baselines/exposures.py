@@ -6,14 +6,14 @@
 
 Light is that of a full exposure. Where all codes are saturated, the answer ends where the shortest exposure resolves
 nothing more. Saturated codes of long exposures tell `moment` and `likelihood` that the light is at least that bright;
-`naive` leaves them out. Sources: textbook; weighting by exposure as for merging bracketed photographs.
+`naive` leaves them out. Both are corrected for the bias of curved responses (few_codes.py), and all are negative below
+the codes of a dark pixel. Sources: textbook; weighting by exposure as for merging bracketed photographs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import lru_cache
-from math import log
 
 import numpy as np
 from numpy import ndarray as Array
@@ -21,12 +21,11 @@ from numpy import ndarray as Array
 from qsim.sensor.estimation import pieces
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
+from quiver.baselines import few_codes
+from quiver.baselines.few_codes import levels, times_of
 from quiver.baselines.naive_mean import dark_codes
-from quiver.baselines.sliding_window import check_window, checked_codes, in_units, window_frames
+from quiver.baselines.sliding_window import check_window, checked_codes, existing_frames, in_units
 
-GRID = 1024  # levels of light from DARKEST on; a parabola through the best three errs by less than 1e-3 of the light
-DARKEST = 1e-5  # of the brightest light: the first level above darkness
-FEW = 1e-3  # Poisson events of a full exposure: the first level has no more, however bright the last one is
 CHUNK = 1 << 22  # likelihoods, and entries of histograms, held at a time
 TABLE_BYTES = 1 << 28  # most of a table of likelihoods: 3 exposures of 12 bits
 FEW_BITS = 8  # up to which only the top code counts as saturated: of few codes none is spared near the full well
@@ -58,8 +57,8 @@ def restore(
     frames = range(len(codes)) if frames is None else frames
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     for i, frame in enumerate(frames):
-        taken = window_frames(frame, window, len(codes))
-        seen = codes[taken].reshape(window, -1)
+        taken = existing_frames(frame, window, len(codes))
+        seen = codes[taken].reshape(-1, codes[0].size)
         restored[i] = METHODS[method](seen, shares[taken], sensor, exposure).reshape(codes.shape[1:])
     return in_units(restored, photons_per_unit)
 
@@ -71,7 +70,7 @@ def naive(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> Array
     open_ = codes < _saturated(sensor)
     open_[np.argmin(shares)] |= ~open_.any(axis=0)  # all saturated: the shortest exposure alone
     signal = np.where(open_, codes - dark[:, None], 0.0).sum(axis=0)
-    return np.maximum(signal, 0) * step / (shares[:, None] * open_).sum(axis=0)
+    return np.asarray(signal * step / (shares[:, None] * open_).sum(axis=0))
 
 
 def _saturated(sensor: Sensor) -> int:
@@ -88,17 +87,27 @@ def _saturated(sensor: Sensor) -> int:
 
 def moment(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> Array:
     """Return photons [N] of codes [window, N]: the light whose expected sum is theirs, through the exact responses."""
-    light = np.append(0.0, levels(tuple(np.unique(shares)), sensor, exposure))
-    expected = np.zeros(len(light))
-    for share, times in zip(*np.unique(shares, return_counts=True), strict=True):
-        expected += times * _mean(tuple(np.unique(shares)), share, sensor, exposure)
-    rising = np.concatenate([[True], expected[1:] > np.maximum.accumulate(expected)[:-1]])
-    total = np.minimum(codes.sum(axis=0, dtype=np.int64), expected[-1] - 0.5)
-    return np.interp(total, expected[rising], light[rising])
+    return few_codes.of_sums(sensor, exposure, times_of(shares))[codes.sum(axis=0, dtype=np.int64)]
 
 
 def likelihood(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> Array:
-    """Return the most likely photons [N] of codes [window, N]; saturated codes count as what they are."""
+    """Return the most likely photons [N] of codes [window, N] less their bias; saturated codes are no gaps."""
+    times = times_of(shares)
+    distinct, kinds = np.unique(shares, return_inverse=True)
+    if len(distinct) == 1 and few_codes.counts_suffice(sensor):
+        return moment(codes, shares, sensor, exposure)
+    if few_codes.outcome_shape(sensor, times) is not None:
+        outcome = tuple(codes[kinds == kind].sum(axis=0, dtype=np.int64) for kind in range(len(distinct)))
+        return few_codes.of_outcomes(sensor, exposure, times)[outcome]
+    sums = codes.sum(axis=0, dtype=np.int64)
+    return few_codes.less_bias(likeliest(codes, shares, sensor, exposure), sums, sensor, exposure, times)
+
+
+def likeliest(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> Array:
+    """Return the most likely photons [N] of codes [window, N], on `levels` and by a parabola through the best three.
+
+    They err by less than 1e-3 of the light; those of saturated codes only are the last level.
+    """
     distinct, kinds = np.unique(shares, return_inverse=True)
     light = levels(tuple(distinct), sensor, exposure)
     table = _log_pmf(tuple(distinct), sensor, exposure)
@@ -106,10 +115,7 @@ def likelihood(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> 
     step = max(1, CHUNK // table.shape[1])
     for start in range(0, len(found), step):
         found[start : start + step] = _most_likely(codes[:, start : start + step], kinds, table, light)
-    saturated = (codes == sensor.levels - 1).all(axis=0)
-    top = np.full((len(shares), 1), sensor.levels - 1)
-    bright = moment(top, shares, sensor, exposure)[0]
-    return np.where(saturated, bright, np.minimum(found, bright))
+    return found
 
 
 def _most_likely(codes: Array, kinds: Array, table: Array, light: Array) -> Array:
@@ -125,30 +131,11 @@ def _most_likely(codes: Array, kinds: Array, table: Array, light: Array) -> Arra
     found = np.empty(len(outcomes))
     step = max(1, CHUNK // len(light))
     for start in range(0, len(outcomes), step):
-        found[start : start + step] = _peak(outcomes[start : start + step] @ table.T, light)
+        found[start : start + step] = few_codes.peak(outcomes[start : start + step] @ table.T, light)
     return found[where.ravel()]
 
 
 METHODS: dict[str, Estimate] = {"naive": naive, "moment": moment, "likelihood": likelihood}
-
-
-@lru_cache(maxsize=8)
-def levels(shares: tuple[float, ...], sensor: Sensor, exposure: float) -> Array:
-    """Return the levels of light [G] of full exposures on which estimates are looked for, evenly spaced in log.
-
-    They end where the response of the shortest exposure ends, or that of the longest where responses fall again.
-    """
-    ends = [sensor.response(exposure * share).photons[-1] / share for share in shares]
-    end = min(ends) if np.isfinite(sensor.brightest(exposure)) else max(ends)
-    low = min(DARKEST * end, FEW / sensor.efficiency)
-    return np.geomspace(low, end, 1 + round(log(low / end) / log(DARKEST) * (GRID - 1)))
-
-
-@lru_cache(maxsize=32)
-def _mean(shares: tuple[float, ...], share: float, sensor: Sensor, exposure: float) -> Array:
-    """Return the mean code of one of these exposures in the dark and at `levels`, [1 + G]."""
-    light = np.append(0.0, levels(shares, sensor, exposure)) * share
-    return np.concatenate([sensor.mean(part, exposure * share) for part in pieces(light, sensor.levels)])
 
 
 def table_bytes(shares: Iterable[float], sensor: Sensor, exposure: float) -> int:
@@ -178,16 +165,3 @@ def _log_pmf(shares: tuple[float, ...], sensor: Sensor, exposure: float) -> Arra
             np.maximum(sensor.log_pmf(part * share, exposure * share), -1e6, out=own)
             row += len(part)
     return table
-
-
-def _peak(table: Array, light: Array) -> Array:
-    """Return the light of the largest value of each row of a table [N, G], by a parabola in log light."""
-    best = table.argmax(axis=1)
-    inner = np.clip(best, 1, len(light) - 2)
-    rows = np.arange(len(table))
-    before, middle, after = (table[rows, inner + step] for step in (-1, 0, 1))
-    bend = before - 2 * middle + after
-    shift = np.where(bend < 0, (before - after) / (2 * np.where(bend < 0, bend, -1.0)), 0.0)
-    shift = np.where(best == inner, np.clip(shift, -1, 1), 0.0)
-    spacing = np.log(light[1] / light[0])
-    return np.where(best == 0, 0.0, np.exp(np.log(light[best]) + shift * spacing))

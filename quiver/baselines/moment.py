@@ -1,6 +1,6 @@
-"""Restores by the moment inverse: the mean code of a window through the sensor's exact inverse response.
+"""Restores by the moment inverse: the sum of a window's codes through the sensor's exact inverse response.
 
-    photons = mu^-1(min(mean(codes), top - 1/(2 window)))
+    photons = mu^-1(mean(codes)), corrected for the bias of a curved response   (few_codes.py)
 
 Source: method of moments, textbook. Clipping, rounding, dark counts and dead time are taken into account, because mu
 comes from the sensor's exact distribution. Space and motion are not.
@@ -11,7 +11,8 @@ from __future__ import annotations
 from numpy import ndarray as Array
 
 from qsim.sensor.sensor import Sensor
-from quiver.baselines.sliding_window import restore_by_mean
+from quiver.baselines import few_codes
+from quiver.baselines.sliding_window import check_window, restore_by_sums
 
 
 def restore(
@@ -25,11 +26,13 @@ def restore(
 ) -> Array:
     """Restore codes [T, H, W] from `window` frames around each: float32 [T, H, W], in units of this many photons.
 
-    `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
+    Below the mean code of a dark pixel it is negative, so that noise adds no light. `ValueError` for codes that the
+    sensor cannot produce, a window that does not resolve its response, and an impossible unit.
     """
-    table = sensor.response(exposure)
+    check_window(window)
+    sensor.response(exposure).cap(window)
 
-    def photons_of(mean_code: Array) -> Array:
-        return table.invert(mean_code, window)
+    def table_of(count: int) -> Array:
+        return few_codes.of_sums(sensor, exposure, ((1.0, count),))
 
-    return restore_by_mean(codes, sensor, window, photons_of, photons_per_unit, frames)
+    return restore_by_sums(codes, sensor, window, table_of, photons_per_unit, frames)

@@ -1,6 +1,6 @@
 """Restores by the naive mean: averages the codes of a window and takes them as linear in light.
 
-    photons = max(0, mean(codes) - dark) * white / top
+    photons = (mean(codes) - dark) * white / top
 
 Source: textbook; the lower bound of every table. `white / top` is the nominal light of one code step (1/(gain *
 efficiency)); `dark` are the codes of dark counts and offset in the same linear picture. Clipping and dead time are
@@ -14,7 +14,7 @@ from numpy import ndarray as Array
 
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
-from quiver.baselines.sliding_window import restore_by_mean
+from quiver.baselines.sliding_window import restore_by_sums
 
 
 def dark_codes(sensor: Sensor, exposure: float) -> float:
@@ -35,11 +35,12 @@ def restore(
 ) -> Array:
     """Restore codes [T, H, W] from `window` frames around each: float32 [T, H, W], in units of this many photons.
 
+    Below the codes of a dark pixel it is negative, so that noise adds no light.
     `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
     """
     dark, step = dark_codes(sensor, exposure), sensor.white(exposure) / (sensor.levels - 1)
 
-    def photons_of(mean_code: Array) -> Array:
-        return np.maximum(0, mean_code - dark) * step
+    def table_of(count: int) -> Array:
+        return (np.arange(count * (sensor.levels - 1) + 1) / count - dark) * step
 
-    return restore_by_mean(codes, sensor, window, photons_of, photons_per_unit, frames)
+    return restore_by_sums(codes, sensor, window, table_of, photons_per_unit, frames)

@@ -2,9 +2,9 @@
 
     codes [T, H, W] -> for every frame t the sum of the codes of `window` frames around it
 
-A window of w frames covers t - w//2 ... t + (w-1)//2: centred for odd w, one frame more of the past for even w. Frames
-before the first and after the last are reflections that do not repeat the end frame (-1 is frame 1), several times for
-short clips.
+A window of w frames covers t - w//2 ... t + (w-1)//2: centred for odd w, one frame more of the past for even w. Single
+pixels (naive, moment, likelihood) take those frames of it that exist. For BM3D, frames before the first and after the
+last are reflections that do not repeat the end frame (-1 is frame 1), several times for short clips.
 """
 
 from __future__ import annotations
@@ -60,6 +60,11 @@ def window_frames(frame: int, window: int, length: int) -> Array:
     return reflect(np.arange(frame - window // 2, frame + look_ahead(window) + 1), length)
 
 
+def existing_frames(frame: int, window: int, length: int) -> slice:
+    """Return the frames of the window around `frame` that a clip of `length` frames has."""
+    return slice(max(0, frame - window // 2), min(length, frame + look_ahead(window) + 1))
+
+
 def frame_times(frame: int, window: int, length: int) -> tuple[int, ...]:
     """Return how often each different frame counts in the window around `frame`, in falling order.
 
@@ -86,28 +91,47 @@ def window_sums(codes: Array, window: int, top: int) -> Iterator[Array]:
         yield total
 
 
-def restore_by_mean(
+def existing_sums(codes: Array, window: int, frames: range, top: int) -> Iterator[tuple[int, Array]]:
+    """Yield how many codes are summed, and their sum [H, W], of the existing frames of the window around each frame.
+
+    The sum is a running one, and must not be changed.
+    """
+    dtype = np.uint16 if window * top < 2**16 else np.uint32
+    taken = existing_frames(frames.start, window, len(codes))
+    total = codes[taken].sum(axis=0, dtype=dtype)
+    for frame in frames:
+        here = existing_frames(frame, window, len(codes))
+        for enters in range(taken.stop, here.stop):
+            np.add(total, codes[enters], out=total, casting="unsafe")
+        for leaves in range(taken.start, here.start):
+            np.subtract(total, codes[leaves], out=total, casting="unsafe")
+        taken = here
+        yield here.stop - here.start, total
+
+
+def restore_by_sums(
     codes: Array,
     sensor: Sensor,
     window: int,
-    photons_of: Callable[[Array], Array],
+    table_of: Callable[[int], Array],
     photons_per_unit: float,
     frames: range | None = None,
 ) -> Array:
-    """Return restored frames [T, H, W], all or those in `frames`, of a method that uses a window's mean code only.
+    """Return restored frames [T, H, W], all or those in `frames`, of a method that uses the sum of a window's codes.
 
-    A sum of codes has few values. So the method is one table, `photons_of` every possible mean code, and a running sum.
-    `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
+    `table_of` gives the photons of every sum of so many codes, 0 ... codes * top. `ValueError` for codes that the
+    sensor cannot produce, an empty window and an impossible unit.
     """
     codes = checked_codes(codes, sensor)
     check_window(window)
     top = sensor.levels - 1
-    table = photons_of(np.arange(window * top + 1) / window).astype(np.float32)
+    tables: dict[int, Array] = {}
     frames = range(len(codes)) if frames is None else frames
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
-    for frame, total in enumerate(window_sums(codes, window, top)):
-        if frame in frames:  # no index is clipped; this mode needs no buffer
-            np.take(table, total, out=restored[frame - frames.start], mode="clip")
+    for i, (count, total) in enumerate(existing_sums(codes, window, frames, top)):
+        if count not in tables:
+            tables[count] = table_of(count).astype(np.float32)
+        np.take(tables[count], total, out=restored[i], mode="clip")  # no index is clipped; this mode needs no buffer
     return in_units(restored, photons_per_unit)
 
 

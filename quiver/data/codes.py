@@ -96,9 +96,12 @@ class Codes:
         return self.colour is None or determines_bands(self.colour, self.sensor.efficiency)
 
     def demosaiced(self, light: Array) -> Array:
-        """Return the photons of R, G and B [3, H, W] of the light [H, W] behind the stream's colour filters."""
+        """Return the photons of R, G and B [3, H, W] of the light [H, W] behind the stream's colour filters.
+
+        They have no floor at 0: of a dim band half the estimates lie below 0, and their mean is right.
+        """
         assert self.colour is not None
-        return demosaic(light, self.colour, self.sensor.efficiency)
+        return demosaic(light, self.colour, self.sensor.efficiency, floor=False)
 
 
 def filled(codes: Codes, bad: Array | None) -> Codes:

@@ -42,7 +42,7 @@ def test_the_likelihood_is_the_maximum_of_the_exact_one(kind):
     shares = rng.choice(SCHEDULE, 7)
     light = 10 ** rng.uniform(-1.5, 3, 60)
     codes = drawn(sensor, light, shares, 1)
-    found = exposures.likelihood(codes[:, 0], shares, sensor, EXPOSURE)
+    found = exposures.likeliest(codes[:, 0], shares, sensor, EXPOSURE)
     end = exposures.levels(tuple(np.unique(shares)), sensor, EXPOSURE)[-1]
 
     def value(photons: np.ndarray) -> np.ndarray:

@@ -1,11 +1,11 @@
-"""Sums over sliding windows are sums over reflected frames; wrong codes and windows are named."""
+"""Sums over sliding windows are sums over reflected or existing frames; wrong codes and windows are named."""
 
 import numpy as np
 import pytest
 
 from qsim.sensor.devices import quiver_physical
 from quiver.baselines import moment, naive_mean
-from quiver.baselines.sliding_window import frame_times, look_ahead, reflect, window_frames, window_sums
+from quiver.baselines.sliding_window import existing_sums, frame_times, look_ahead, reflect, window_frames, window_sums
 
 EXPOSURE = 5e-4
 
@@ -19,6 +19,16 @@ def test_running_sums_are_sums_over_reflected_windows(window, length):
         frames = index[40 + t - window // 2 : 40 + t + look_ahead(window) + 1]
         np.testing.assert_array_equal(frames, window_frames(t, window, length))
         np.testing.assert_array_equal(total, codes[frames].astype(int).sum(axis=0))
+
+
+@pytest.mark.parametrize("window", [1, 2, 3, 4, 11])
+def test_sums_of_existing_frames_are_those_of_the_cut_window(window):
+    codes = np.random.default_rng(1).integers(0, 256, (7, 8, 10), dtype=np.uint8)
+    for frames in (range(7), range(2, 6)):
+        for t, (count, total) in zip(frames, existing_sums(codes, window, frames, 255), strict=True):
+            there = [n for n in range(t - window // 2, t + look_ahead(window) + 1) if 0 <= n < 7]
+            assert count == len(there)
+            np.testing.assert_array_equal(total, codes[there].astype(int).sum(axis=0))
 
 
 def test_reflection_goes_on_and_on():
