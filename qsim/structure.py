@@ -294,6 +294,7 @@ STREAM: Table = {
     ),
     "drawn_by, if any": TEXT,
     "dead_time_effects, if any": OBJECT,
+    "temperature, if any": NUMBER,
 }
 JOB: Table = {"split": SPLIT, "digest": TEXT, "scene, if any": TEXT, "state, if any": TEXT, "record, if any": DIGEST}
 DATASET: Table = {"name": TEXT, "recipe": {"recipe, if any": OBJECT}, "jobs": OBJECT}

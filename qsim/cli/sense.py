@@ -68,6 +68,9 @@ def add_sense(sub: Any) -> None:
         "--follow", action="store_true", help="counting SPAD: draw photon by photon, so that their times are known"
     )
     parser.add_argument(
+        "--temperature", type=float, help="degrees C of a sensor file with dark_doubling (default: the file's own)"
+    )
+    parser.add_argument(
         "--replay", metavar="CLIP:FRAME", help="draw one frame again and compare it with the stored one"
     )
     parser.add_argument("--force", action="store_true", help="replace a stream of the same name")
@@ -90,7 +93,8 @@ def _run_sense(args: argparse.Namespace) -> int:
     wanted = [
         Sensing(args.sensor or "quiver-physical", args.bits, seed=args.seed, name=args.name, group=args.group,
                 diffraction=args.diffraction, defects=args.defects, slices=args.slices, rows=rows,
-                colour=args.colour, exposures=args.exposures, follow=args.follow, **level)
+                colour=args.colour, exposures=args.exposures, follow=args.follow,
+                temperature=args.temperature, **level)
         for level in levels
     ]  # fmt: skip
     clips = [clip for path in args.paths for clip in _clips(path)]
@@ -136,7 +140,17 @@ def _light(meta: dict[str, Any]) -> dict[str, Any]:
 def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
     from qsim.clip.sensing import replay
 
-    unused = ["group", "diffraction", "defects", "row_delay", "row_order", "exposures", "follow", "force"]
+    unused = [
+        "group",
+        "diffraction",
+        "defects",
+        "row_delay",
+        "row_order",
+        "exposures",
+        "follow",
+        "temperature",
+        "force",
+    ]
     refuse_idle(args, "--replay draws what is stored", unused)
     if args.slices != 1:
         raise ValueError("--replay draws what is stored: --slices changes nothing here; leave it out")

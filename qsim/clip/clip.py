@@ -67,6 +67,7 @@ class Clip(ClipFolder):
         colour: str | os.PathLike[str] | ColourFilter | None = None,
         exposures: tuple[float, ...] | None = None,
         follow: bool = False,
+        temperature: float | None = None,
         force: bool = False,
         progress: Progress | None = None,
     ) -> Stream:
@@ -82,7 +83,7 @@ class Clip(ClipFolder):
         defects = os.fspath(defects) if isinstance(defects, os.PathLike) else defects
         colour = os.fspath(colour) if isinstance(colour, os.PathLike) else colour
         light = (chosen, bits, ppp, lux, seed, name)
-        wanted = Sensing(*light, group, diffraction, defects, slices, rows, colour, exposures, follow)
+        wanted = Sensing(*light, group, diffraction, defects, slices, rows, colour, exposures, follow, temperature)
         return self.stream(sense(self, wanted, force=force, progress=progress)[0].name)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,15 @@ from numpy import ndarray as Array
 
 from qsim.clip.clip_folder import ClipFolder
 from qsim.optics.diffraction import diffract
-from qsim.optics.radiometry import Crop, LightLevel, band_photons, expected_photons, photons_per_lux, ppp_factor
+from qsim.optics.radiometry import (
+    Crop,
+    LightLevel,
+    band_photons,
+    expected_photons,
+    photons_per_lux,
+    photopic,
+    ppp_factor,
+)
 from qsim.sensor.colour_filter import ColourFilter
 
 _MOST = 1e12  # photons per pixel and frame: the exact laws are tested up to it
@@ -85,13 +94,24 @@ def clip_photons(
     return expected_photons(radiance, camera, clip.exposure, origin=(y, x)) * factor
 
 
-def light_line(level: LightLevel, efficiency: float, filters: ColourFilter | None = None) -> str:
+def light_line(
+    level: LightLevel,
+    efficiency: float,
+    filters: ColourFilter | None = None,
+    bands: Sequence[float] | None = None,
+) -> str:
     """Return a one-line summary of the light level of a sensor; behind filters the electrons of equal bands.
 
-    `light scaled by 0.1228 to 3.25 photons/pixel (2.6 e-, equivalent to 1.313 lx at 555 nm)`
+    `light scaled by 0.1228 to 3.25 photons/pixel (2.6 e-, equivalent to 1.313 lx at 555 nm)`; of a colour clip, whose
+    level is the mean over `bands` [m], also the photons of all bands, and photopic lux if all have equally many.
     """
     lux = "" if level.lux is None else f", equivalent to {level.lux:.4g} lx at 555 nm"
     electrons = f"{level.ppp * efficiency:.3g} e-"
+    unit = "photons/pixel"
     if filters is not None:
         electrons = f"about {level.ppp * filters.mean_efficiency(efficiency):.3g} e- with equal bands"
-    return f"light scaled by {level.factor:.4g} to {level.ppp:.4g} photons/pixel ({electrons}{lux})"
+    if bands is not None:
+        unit = f"photons/pixel and band, {len(bands) * level.ppp:.4g} of all bands"
+        lux = "" if level.lux is None else f", photons of {level.lux:.4g} lx at 555 nm in each band"
+        lux += "" if level.lux is None else f", together {level.lux * photopic(bands):.4g} photopic lx"
+    return f"light scaled by {level.factor:.4g} to {level.ppp:.4g} {unit} ({electrons}{lux})"

@@ -23,13 +23,14 @@ from qsim.clip.rows import Rows
 from qsim.clip.simulation import Draw, plane_of, same_settings, stored
 from qsim.clip.stream import Stream, orientation, write_packed, writing
 from qsim.files import Progress, check_name
-from qsim.sensor import colour_filter, devices, packing
+from qsim.sensor import colour_filter, devices, file_laws, packing
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.event_simulation import TOLERANCE, Effects
 from qsim.sensor.defects.pixel_array import PixelArray, require_effect
+from qsim.sensor.file_laws import Conditions
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
@@ -54,6 +55,7 @@ class Sensing:
     colour: str | ColourFilter | None = None  # rggb, quad, rgbw or .toml with a table [colour]; None: as for defects
     exposures: tuple[float, ...] | None = None  # shares of a code's time, in turn; None: all of it
     follow: bool = False  # counting SPAD: draw photon by photon, even where the closed form is exact
+    temperature: float | None = None  # degrees C of a sensor file with dark_doubling; None: that of the file
 
     def __post_init__(self) -> None:
         """Replace numbers of NumPy, which JSON cannot hold, by those of Python."""
@@ -143,9 +145,16 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     if sensing.rows is not None:
         _check_rows(sensing, clip, 1 if sensing.group else planes)
     level = light_level(clip, ppp=None if sensing.ppp is None else sensing.ppp / planes, lux=sensing.lux)
+    conditions = Conditions(sensing.temperature, _wavelength(clip), None if found is None else found.pattern.dark)
     sensor = own or devices.load(
-        sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes
+        sensing.sensor,
+        ppp=level.ppp * planes,
+        bits=sensing.bits,
+        exposure=clip.exposure * planes,
+        conditions=conditions,
     )
+    if filters is not None and own is None:
+        filters = _by_curve(filters, clip, sensing)
     if found is not None and isinstance(sensor, SpikeCamera):
         raise ValueError(f"{sensing.sensor_name}: defects of spike cameras are not modelled; leave [defects] out")
     if found is not None:  # a measured dark map replaces the dark rate of the sensor
@@ -158,6 +167,25 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     shares = None if sensing.exposures is None else _checked_exposures(sensing, sensor, found)
     draw = Draw(sensor, plane, level, key, planes, sensing.diffraction, found, rows=sensing.rows, colour=filters)
     return dataclasses.replace(draw, shares=shares, origin=clip.origin)
+
+
+def _wavelength(clip: ClipFolder) -> float | None:
+    """Return the wavelength [m] at which a curve of efficiency is read: that of the camera, of colours the second."""
+    if clip.bands is not None:
+        return clip.bands[1]
+    return None if clip.camera is None else clip.camera.wavelength
+
+
+def _by_curve(filters: ColourFilter, clip: ClipFolder, sensing: Sensing) -> ColourFilter:
+    """Return filters that pass all light of their bands to the efficiency of the file's qe_curve, if it has one."""
+    curve = devices.table_of(sensing.sensor).get("qe_curve")
+    if curve is None or clip.bands is None:
+        return filters
+    if filters.efficiency is not None:
+        raise ValueError(f"{sensing.sensor_name}: [colour] efficiency and qe_curve state the same; leave one out")
+    red, green, blue = (file_laws.efficiency_at(curve, band, sensing.sensor_name) for band in clip.bands)
+    passed = {"R": (red, 0.0, 0.0), "G": (0.0, green, 0.0), "B": (0.0, 0.0, blue), "W": (red, green, blue)}
+    return dataclasses.replace(filters, efficiency={colour: passed[colour] for colour in "".join(filters.mask)})
 
 
 def _checked_exposures(sensing: Sensing, sensor: Sensor, found: Defects | None) -> tuple[float, ...]:
@@ -249,7 +277,14 @@ def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
         | ({} if draw.colour is None else {"colour": draw.colour.to_dict()})
         | ({} if draw.shares is None else {"exposures": list(draw.shares)})
         | ({} if draw.origin == (0, 0) else {"origin": list(draw.origin)})
+        | _temperature(sensing)
     )
+
+
+def _temperature(sensing: Sensing) -> dict[str, float]:
+    """Return the temperature [degrees C] at which a sensor file with such a law was read."""
+    found = file_laws.temperature_of(devices.table_of(sensing.sensor), sensing.temperature)
+    return {} if found is None else {"temperature": found}
 
 
 def sense(
@@ -271,7 +306,7 @@ def sense(
     meta = describe(clip, sensing, draw)
     efficiency = draw.sensor.efficiency
     whole = dataclasses.replace(draw.level, ppp=draw.level.ppp * draw.planes)  # of a code, not of a clip frame
-    line = light_line(whole, efficiency, draw.colour)
+    line = light_line(whole, efficiency, draw.colour, clip.bands)
     if draw.colour is not None:
         line += f"; {draw.colour.words(efficiency)}"
     if draw.rows is not None:

@@ -315,6 +315,9 @@ def stored(stream: Stream) -> Draw:
     return dataclasses.replace(draw, rows=stream.rows, shares=stream.shares, origin=stream.origin)
 
 
+OPTIONAL = ("defects", "rows", "colour", "exposures", "origin", "temperature")  # keys that are left out where off
+
+
 def same_settings(old: dict[str, Any], new: dict[str, Any]) -> bool:
     """Return whether two descriptions of streams have the same settings; folders of files do not count, nor do the
     stated effects of dead time: `drawn_by` tells what they led to.
@@ -322,7 +325,7 @@ def same_settings(old: dict[str, Any], new: dict[str, Any]) -> bool:
     old, new = _without_folders(old), _without_folders(new)
     new.pop("dead_time_effects", None)
     same = all(old.get(key) == value for key, value in new.items())
-    return same and all(old.get(key) == new.get(key) for key in ("defects", "rows", "colour", "exposures", "origin"))
+    return same and all(old.get(key) == new.get(key) for key in OPTIONAL)
 
 
 def _without_folders(meta: dict[str, Any]) -> dict[str, Any]:

@@ -99,12 +99,20 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
     """
     from qsim.rendering import fidelity
     from qsim.sensor import devices
+    from qsim.sensor.file_laws import Conditions
 
     settings = job.settings
     electrons, of_code, ppp = 0.0, 0.0, None
     for sensing in job.streams:
         if sensing.ppp is not None:
-            sensor = devices.load(sensing.sensor, ppp=sensing.ppp, bits=sensing.bits, exposure=1 / settings.frame_rate)
+            conditions = Conditions(sensing.temperature, scene.camera.wavelength)
+            sensor = devices.load(
+                sensing.sensor,
+                ppp=sensing.ppp,
+                bits=sensing.bits,
+                exposure=1 / settings.frame_rate,
+                conditions=conditions,
+            )
             share, of_frame = sensor.efficiency, sensing.ppp / sensing.planes
             of_code = max(of_code, of_frame * share * sensing.planes)
             if of_frame * share > electrons:

@@ -5,6 +5,7 @@
                first  int64 [H W + 1]: pixel (y, x) has the events first[y W + x] ... first[y W + x + 1] - 1
                meta   uint8, a JSON text: format, shape [T, H, W], exposure, frame_rate, sensor; rows, if delayed
 
+Time 0 is the start of the exposure of frame 0; in scenes and flicker it is its middle, half an exposure later.
 Frame t is exposed from t / frame_rate on, by each row's clock if rows have delays. Times are not rounded, so dead times
 hold exactly. Events of kind 0 came while the pixel was dead: with them the file holds the photons that other pixels
 would have seen.

@@ -26,6 +26,49 @@ PLANCK = 6.62607015e-34  # J s, exact (SI)
 LIGHT_SPEED = 299792458.0  # m s^-1, exact (SI)
 LUMINOUS_EFFICACY = 683.0  # lm W^-1 at 540 THz, exact (SI); K_m at 555 nm
 LUX_WAVELENGTH = 555e-9  # m, where V(lambda) = 1: every lux of this module is light of this wavelength
+V_LAMBDA = (
+    0.00004,
+    0.00012,
+    0.0004,
+    0.0012,
+    0.0040,
+    0.0116,
+    0.023,
+    0.038,
+    0.060,
+    0.09098,
+    0.13902,
+    0.20802,
+    0.323,
+    0.503,
+    0.710,
+    0.862,
+    0.954,
+    0.99495,
+    0.995,
+    0.952,
+    0.870,
+    0.757,
+    0.631,
+    0.503,
+    0.381,
+    0.265,
+    0.175,
+    0.107,
+    0.061,
+    0.032,
+    0.017,
+    0.00821,
+    0.004102,
+    0.002091,
+    0.001047,
+    0.00052,
+    0.000249,
+    0.00012,
+    0.00006,
+    0.00003,
+    0.000015,
+)  # of 380 to 780 nm in steps of 10 nm; CIE 1924
 RGB = (610e-9, 540e-9, 460e-9)  # m, of the bands R, G and B of colour clips unless a scene states others
 WHITE_PER_MEAN = 2.5  # white of a clip or stream over its mean light: the peak of scores and of requested errors
 
@@ -127,6 +170,15 @@ def photons_per_lux(camera: Camera, exposure: float) -> float:
     """Return photons per pixel in `exposure` [s] for one lux of 555 nm on the faceplate: 2.47 for 1.1 um and 0.5 ms."""
     area = camera.fill_factor * camera.pixel_pitch**2
     return area * exposure / (LUMINOUS_EFFICACY * photon_energy(LUX_WAVELENGTH))
+
+
+def photopic(bands: Sequence[float]) -> float:
+    """Return the photopic lux of equally many photons in each of `bands` [m] over the lux of so many of 555 nm.
+
+    1.51 of 610, 540 and 460 nm. V(lambda) is that of CIE 1924 every 10 nm, linear between.
+    """
+    visible = np.interp(np.asarray(bands) * 1e9, 380 + 10 * np.arange(len(V_LAMBDA)), V_LAMBDA, left=0, right=0)
+    return float(np.sum(visible * LUX_WAVELENGTH / np.asarray(bands)))
 
 
 def ppp_factor(mean_photons: float, target: float, name: str = "clip") -> float:

@@ -13,6 +13,7 @@ photons" means that light is to be given as photons that this sensor detects. A 
     dark_current = 1.6           # e-/s
     read_noise = 0.2             # e- rms
     bits = 3
+    # median, dark_doubling, qe_curve ...: the laws of file_laws.py
     # full_well = 10000          # e-; a QIS with iso = 400 in place of gain fills its code by a quarter of it
     [sources]                    # optional: one sentence per field
     read_noise = "photon transfer of 2026-05-03, 25 C"
@@ -23,13 +24,15 @@ photons" means that light is to be given as photons that this sensor detects. A 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 
 from qsim import files
 from qsim.checks import suggest
+from qsim.sensor import file_laws
 from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.file_laws import NOTHING, Conditions
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
@@ -97,6 +100,7 @@ class Device:
     make: Callable[[float | None, int, float], Sensor]  # (ppp, bits, exposure [s]) -> Sensor
     sources: Mapping[str, str]  # field -> source, condition
     follows_light: bool = False  # the gain is set from the PPP
+    median: bool = False  # its dark rate is that of the median pixel
 
 
 _QUIVER_SOURCES = {
@@ -189,6 +193,7 @@ DEVICES: Mapping[str, Device] = MappingProxyType(
                     "excess bias; Morimoto et al., Optica 7, 346 (2020), arXiv:1912.12910",
                     "dark_count_rate": "0.4 /s, median, 3.3 V excess bias; same paper",
                 },
+                median=True,
             ),
             Device(
                 "megax-b",
@@ -200,6 +205,7 @@ DEVICES: Mapping[str, Device] = MappingProxyType(
                     "excess bias; Morimoto et al., Optica 7, 346 (2020), arXiv:1912.12910",
                     "dark_count_rate": "2.0 /s, median, 3.3 V excess bias; same paper",
                 },
+                median=True,
             ),
             Device(
                 "spad512s",
@@ -232,36 +238,49 @@ TABLES = ("sensor", "sources", "defects", "colour")  # of a file; defect_table.p
 
 
 def load(
-    name: str | Path | Sensor, *, ppp: float | None = None, bits: int | None = None, exposure: float = 5e-4
+    name: str | Path | Sensor,
+    *,
+    ppp: float | None = None,
+    bits: int | None = None,
+    exposure: float = 5e-4,
+    conditions: Conditions = NOTHING,
 ) -> Sensor:
     """Return the sensor of a name in `DEVICES` or of a TOML file; a `Sensor` is returned as given.
 
     `ppp` [photons/pixel] sets the gain where it follows the light. `bits` replaces the device's own depth (a TOML file
-    and a `Sensor` state their own). `exposure` [s] matters for dark electrons given per frame. `ValueError` names what
-    is wrong.
+    and a `Sensor` state their own). `exposure` [s] matters for dark electrons given per frame, `conditions` for the
+    laws of a file (file_laws.py). `ValueError` names what is wrong.
     """
+    if conditions.temperature is not None and (isinstance(name, Sensor) or str(name) in DEVICES):
+        shown = type(name).__name__ if isinstance(name, Sensor) else name
+        raise ValueError(
+            f"{shown}: has no law of temperature; use a sensor file with dark_doubling and dark_reference, or leave "
+            "the temperature out"
+        )
     if isinstance(name, Sensor):
         if bits is not None and bits != name.bits:
             raise ValueError(f"{type(name).__name__}: has bits = {name.bits}, the request {bits}; change one of them")
         return name
     if str(name) in DEVICES:
         device = DEVICES[str(name)]
-        return device.make(ppp, device.bits if bits is None else bits, exposure)
+        made = device.make(ppp, device.bits if bits is None else bits, exposure)
+        return made.with_dark_rate(made.dark_rate * conditions.dark.mean) if device.median and conditions.dark else made
     path = Path(name)
     if path.suffix != ".toml":
         raise ValueError(
             f"unknown sensor {str(name)!r}{suggest(str(name), DEVICES)}; `qsim doctor --devices` lists all"
         )
-    sensor = from_toml(path, bits)
+    sensor = from_toml(path, bits, conditions)
     if bits is not None and bits != sensor.bits:
         raise ValueError(f"{path}: the file has bits = {sensor.bits}, the request {bits}; change one of them")
     return sensor
 
 
-def from_toml(path: str | Path, bits: int | None = None) -> Sensor:
+def from_toml(path: str | Path, bits: int | None = None, conditions: Conditions = NOTHING) -> Sensor:
     """Return the sensor of a TOML file with a table [sensor] and, optionally, [sources] and [defects]; strict.
 
-    `bits` is the depth of a code where the file states none: such a file serves every depth.
+    `bits` is the depth of a code where the file states none: such a file serves every depth. Without a spread of dark
+    rates in `conditions`, a median is that of the file's own [defects].
     """
     path = Path(path)
     tables = files.read_toml(path, "sensor file")
@@ -274,9 +293,16 @@ def from_toml(path: str | Path, bits: int | None = None) -> Sensor:
         if bits is None:
             raise ValueError(f"{path}: states no bits, so it serves every depth; say which one, as in --bits 3")
         tables["sensor"]["bits"] = bits
-    sensor = from_dict(_with_gain(tables["sensor"], f"{path}: [sensor]"), where=f"{path}: [sensor]")
+    table = tables["sensor"]
+    if "median" in table and conditions.dark is None and isinstance(tables.get("defects"), dict):
+        from qsim.sensor.defects import defect_table
+
+        own = defect_table.from_toml(path)
+        conditions = replace(conditions, dark=None if own is None else own.pattern.dark)
+    plain = file_laws.resolved(table, f"{path}: [sensor]", conditions)
+    sensor = from_dict(_with_gain(plain, f"{path}: [sensor]"), where=f"{path}: [sensor]")
     known = [field.name for field in fields(sensor)]  # type: ignore[arg-type]  # every model is a dataclass
-    known += ["iso"] if "iso" in tables["sensor"] else []
+    known += [key for key in ("iso", *file_laws.KEYS) if key in table]
     for key in tables.get("sources", {}):
         if key not in known:
             raise ValueError(f"{path}: unknown key {key!r} in [sources]{suggest(key, known)}")
@@ -307,6 +333,14 @@ def _with_gain(settings: dict[str, object], where: str) -> dict[str, object]:
         )
     gain = numbers["iso"] / 100 * room / numbers["full_well"]
     return {key: value for key, value in settings.items() if key != "iso"} | {"gain": gain}
+
+
+def table_of(name: str | Path | Sensor) -> Mapping[str, object]:
+    """Return the table [sensor] of a TOML file as it is written; empty for other sensors."""
+    if isinstance(name, Sensor) or Path(name).suffix != ".toml":
+        return {}
+    table: object = files.read_toml(Path(name), "sensor file").get("sensor")
+    return table if isinstance(table, dict) else {}
 
 
 def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:

@@ -2,9 +2,10 @@
 
     charge += N,  N ~ Poisson(QE photons + dark t);   spike = charge >= threshold;   charge -= threshold, or charge = 0
 
-A pixel fires at most once per plane. Reset by subtraction keeps the charge above the threshold, however bright it is;
-reset to zero loses it. The charge begins anywhere below the threshold with equal probability, as in a camera that has
-been running. Spikes have a memory: the planes of a pixel are drawn in order, from the first.
+A pixel fires at most once per plane. Reset by subtraction keeps the charge above the threshold without limit: after n
+planes of k thresholds each, a pixel glows on in the dark for (k - 1) n planes. Reset to zero loses it. The charge
+begins anywhere below the threshold with equal probability, as in a camera that has been running. Spikes have a memory:
+the planes of a pixel are drawn in order, from the first.
 
 **The law of one plane** at constant light, in the long run, with n electrons per plane and a threshold of m:
 
@@ -40,7 +41,7 @@ class SpikeCamera(Sensor):
     quantum_efficiency: float  # electrons per photon, 0 ... 1
     dark_current: float  # e-/s
     threshold: int  # e-, 1 ... 2^20
-    subtracts: bool = True  # reset by subtraction of the threshold; False: to zero
+    subtracts: bool = True  # reset by subtraction: bright pixels glow on (see above); False: to zero
     bits: int = 1
 
     code_model: ClassVar[str] = "spikes"

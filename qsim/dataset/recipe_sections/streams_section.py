@@ -18,6 +18,7 @@ STREAMS: Table = {
     "group, if any": checks.flag, "slices, if any": checks.whole, "diffraction, if any": checks.flag,
     "row_delay, if any": checks.positive, "row_order, if any": checks.row_order,
     "colour, if any": checks.text, "exposures, if any": checks.shares,
+    "temperature, if any": checks.real,
 }  # fmt: skip
 
 
@@ -26,7 +27,9 @@ def streams_of(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     given = section.values(STREAMS)
     levels = _light(section, given)
     bits, name = given.get("bits", [None]), given.get("name")
-    sensor = _sensor(section, given["sensor"], bits, given.get("group", False), given.get("slices", 1))
+    sensor = _sensor(
+        section, given["sensor"], bits, given.get("group", False), given.get("slices", 1), given.get("temperature")
+    )
     with section.naming("row_order"):
         rows = Rows.of(given.get("row_delay"), given.get("row_order"))
     if name is not None and (count := len(bits) * len(levels)) > 1:
@@ -45,6 +48,7 @@ def streams_of(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
             follow=given.get("follow", False),
             rows=rows,
             exposures=given.get("exposures"),
+            temperature=given.get("temperature"),
             **light,
         )
         for b in bits
@@ -73,15 +77,18 @@ def _light(section: Section, given: dict[str, Any]) -> list[dict[str, Any]]:
     return [{}]
 
 
-def _sensor(section: Section, sensor: str, bits: list[int | None], group: bool, slices: int) -> str:
+def _sensor(
+    section: Section, sensor: str, bits: list[int | None], group: bool, slices: int, temperature: float | None
+) -> str:
     """Return the sensor's name or absolute file; `ValueError` if it lacks these bits, or cannot be read as asked."""
     from qsim.sensor import QIS, BinarySPAD, CountingSPAD, devices
+    from qsim.sensor.file_laws import Conditions
 
     if sensor.endswith(".toml"):
         sensor = str((section.text.path.parent / sensor).resolve())
     for depth in bits:
         with section.naming("sensor"):
-            found = devices.load(sensor, ppp=3.25, bits=depth, exposure=5e-4)
+            found = devices.load(sensor, ppp=3.25, bits=depth, exposure=5e-4, conditions=Conditions(temperature))
         known = depth is not None or sensor.endswith(".toml")
         if group and not (known and isinstance(found, BinarySPAD)):
             what = f"this is a {type(found).__name__}" if known else "the bits of a code are needed, as in bits = 3"

@@ -17,7 +17,8 @@
     dead_map = "my_bad.npy"        # true where a pixel never fires [H, W]
     offset_map = "my_offset.npy"   # QIS: codes [H, W]
     read_noise_map = "my_rn.npy"   # QIS: e- rms [H, W]
-    crosstalk = 0.001              # chance that an avalanche sets off one given neighbour of the four
+    crosstalk = 0.001              # per neighbour: chance that an avalanche sets off one given of the four; data sheets
+                                   # often give the total, here 1 - (1 - 0.001)^4 = 0.004 for any of them
     afterpulse = 0.01              # clocked: chance of a detection caused by one in the plane before
     afterpulse_delay = 2e-8        # counting: s, mean delay of the afterpulse of a count
     carry_dead_time = true         # counting: a dead time continues in the next exposure

@@ -184,6 +184,10 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Acts("sense clip --sensor counter.toml --ppp 3 --name n", "--follow"),
         Refused("sense clip", "--follow", "followed"),
     ],
+    ("sense", "--temperature"): [
+        Refused("sense clip", "--temperature 20", "no law of temperature"),
+        Refused("sense clip --replay clip:1", "--temperature 20", "draws what is stored"),
+    ],
     ("sense", "--replay"): [
         Acts("sense clip --ppp 3.25 --bits 3", "--replay clip:1", stdout, before="sense clip --ppp 3.25 --bits 3"),
         Refused("sense clip --replay clip:1", "--ppp 3.25,26", "2 light levels"),

@@ -98,7 +98,7 @@ def test_electrons_behind_colour_filters_are_those_of_the_mosaic(tmp_path):
     clip = colour_clip(tmp_path / "c", height=8, width=10)
     stream, line = sense(clip, Sensing("quiver-physical", ppp=3.25, bits=3, colour="rgbw", name="mosaic"))
     assert ", about 3.9 e⁻ per pixel with equal bands; 3 bit, QIS" in clip_section.stream_line(stream)
-    assert "(about 3.9 e- with equal bands, equivalent to" in line
+    assert "9.75 of all bands (about 3.9 e- with equal bands, photons of" in line
 
 
 def test_motion_is_that_of_the_pixels_that_move(folder):

@@ -1,0 +1,130 @@
+"""Reads the laws of a sensor file: a median dark rate, dark counts over temperature, efficiency over wavelength.
+
+    # my_sensor.toml; each line is optional, and a missing one changes no bit
+    [sensor]
+    model = "BinarySPAD"
+    median = 0.4                   # 1/s, dark rate of the median pixel, in place of the mean (dark_count_rate)
+    dark_doubling = 8.0            # K: the dark rate doubles per so many kelvin
+    dark_reference = 25.0          # degrees C at which the dark rate is stated
+    temperature = 40.0             # degrees C of the sensor; default: dark_reference
+    qe_curve = [[450e-9, 0.30], [550e-9, 0.50], [650e-9, 0.35]]  # m, efficiency, in place of pde
+
+    dark rate = stated rate * 2^((temperature - dark_reference) / dark_doubling)
+
+They are laws of the file: the sensor that comes out of them has one dark rate and one efficiency. A clip of one band
+has one wavelength, that of its camera; the bands of a colour clip have one each, and each light is taken at that
+wavelength alone. Between the points of a curve the efficiency is linear.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from qsim.sensor.defects.fixed_pattern import DarkSpread
+
+KEYS = ("median", "dark_doubling", "dark_reference", "temperature", "qe_curve")
+DARK = {"QIS": "dark_current", "SpikeCamera": "dark_current"}  # of other models: dark_count_rate
+EFFICIENCY = {"QIS": "quantum_efficiency", "SpikeCamera": "quantum_efficiency"}  # of other models: pde
+COLDEST, HOTTEST = -273.15, 300.0  # degrees C
+WAVELENGTH = 550e-9  # m, where no clip states another: that of cameras
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a sensor file is read for; None: as the file states it."""
+
+    temperature: float | None = None  # degrees C
+    wavelength: float | None = None  # m, of light of one band; None: WAVELENGTH
+    dark: DarkSpread | None = None  # the spread of dark rates that makes a mean of a median
+
+
+NOTHING = Conditions()
+
+
+def resolved(table: Mapping[str, Any], where: str, conditions: Conditions = NOTHING) -> dict[str, Any]:
+    """Return a table [sensor] without these laws, its dark rate and efficiency as they give them; `ValueError`."""
+    plain = {key: value for key, value in table.items() if key not in KEYS}
+    model = table.get("model")
+    dark, efficiency = DARK.get(str(model), "dark_count_rate"), EFFICIENCY.get(str(model), "pde")
+    if "median" in table:
+        if dark in table:
+            raise ValueError(f"{where}: {dark} (a mean) and median state the dark rate twice; leave one out")
+        factor = 1.0 if conditions.dark is None else conditions.dark.mean
+        plain[dark] = _number(table, "median", where, 0.0) * factor
+    if (factor := dark_factor(table, where, conditions.temperature)) != 1:
+        if dark not in plain:
+            raise ValueError(f"{where}: {dark} is missing; dark_doubling is the law of a stated dark rate")
+        plain[dark] = _number(plain, dark, where, 0.0) * factor
+    if "qe_curve" in table:
+        if efficiency in table:
+            raise ValueError(f"{where}: {efficiency} and qe_curve state the efficiency twice; leave one out")
+        plain[efficiency] = efficiency_at(table["qe_curve"], conditions.wavelength or WAVELENGTH, where)
+    return plain
+
+
+def dark_factor(table: Mapping[str, Any], where: str, temperature: float | None = None) -> float:
+    """Return the dark rate at a temperature [degrees C], or at that of the table, over the stated one; `ValueError`."""
+    if "dark_doubling" not in table:
+        for key in ("dark_reference", "temperature"):
+            if key in table:
+                raise ValueError(f"{where}: {key} needs dark_doubling, the kelvin per doubling of the dark rate")
+        if temperature is not None:
+            raise ValueError(f"{where}: has no law of temperature; give it dark_doubling and dark_reference, or leave "
+                             "the temperature out")  # fmt: skip
+        return 1.0
+    if "dark_reference" not in table:
+        raise ValueError(f"{where}: dark_doubling needs dark_reference, the degrees C of the stated dark rate")
+    doubling = _number(table, "dark_doubling", where, 0.1)
+    reference = _number(table, "dark_reference", where, COLDEST, HOTTEST)
+    own = _number(table, "temperature", where, COLDEST, HOTTEST) if "temperature" in table else reference
+    here = own if temperature is None else temperature
+    if not COLDEST <= here <= HOTTEST:
+        raise ValueError(f"{where}: the temperature is in degrees C, {COLDEST:g} to {HOTTEST:g}, got {here!r}")
+    power = (here - reference) / doubling
+    if abs(power) > 100:
+        raise ValueError(
+            f"{where}: {here:g} degrees C are {power:.3g} doublings of the dark rate; at most 100 are taken"
+        )
+    return float(2.0**power)
+
+
+def temperature_of(table: Mapping[str, Any], temperature: float | None) -> float | None:
+    """Return the temperature [degrees C] that a checked table is read at; None without a law."""
+    if "dark_doubling" not in table:
+        return None
+    return float(temperature if temperature is not None else table.get("temperature", table["dark_reference"]))
+
+
+def efficiency_at(curve: Any, wavelength: float, where: str) -> float:
+    """Return the efficiency of a curve [[m, efficiency], ...] at a wavelength [m]; `ValueError` outside of it."""
+    right = isinstance(curve, Sequence) and len(curve) >= 2 and all(_is_point(point) for point in curve)
+    lengths = [point[0] for point in curve] if right else []
+    if not right or any(after <= before for before, after in itertools.pairwise(lengths)):
+        raise ValueError(
+            f"{where}: qe_curve is two or more points [wavelength in m, efficiency from 0 to 1] of rising wavelength, "
+            f"as in [[450e-9, 0.3], [650e-9, 0.4]]; got {curve!r}"
+        )
+    if not lengths[0] <= wavelength <= lengths[-1]:
+        span = f"{1e9 * lengths[0]:g} to {1e9 * lengths[-1]:g} nm"
+        raise ValueError(f"{where}: qe_curve covers {span}, and the light has {1e9 * wavelength:g} nm; extend it")
+    found = float(np.interp(wavelength, lengths, [point[1] for point in curve]))
+    if found <= 0:
+        raise ValueError(f"{where}: qe_curve is 0 at {1e9 * wavelength:g} nm, so this sensor sees no such light")
+    return found
+
+
+def _is_point(point: Any) -> bool:
+    numbers = isinstance(point, Sequence) and not isinstance(point, str) and len(point) == 2
+    return numbers and all(type(v) in (int, float) for v in point) and 1e-7 <= point[0] <= 2e-5 and 0 <= point[1] <= 1
+
+
+def _number(table: Mapping[str, Any], key: str, where: str, low: float, high: float = 1e12) -> float:
+    value = table[key]
+    if type(value) not in (int, float) or not low <= value <= high:
+        raise ValueError(f"{where}: {key} is a number from {low:g} to {high:g}, got {value!r}")
+    return float(value)
