@@ -1,19 +1,24 @@
 """Measures the statistics of a stack of frames, block by block in constant memory.
 
-    codes [t, H, W], block after block  ->  histogram, per-pixel sums of x, x^2 and x_t x_(t+1), and over neighbours
+    codes [t, H, W], block after block  ->  histogram, a sample of the codes, and per-pixel sums of x, x^2, x_t x_(t+1)
+    and over neighbours
 
-A million frames need as much memory as one. Codes are integers; float arrays are accepted if every value is integer.
+A million frames need as much memory as 256. Codes are integers; float arrays are accepted if every value is integer.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from math import ceil, sqrt
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
+
+SAMPLED_PIXELS = 1 << 17  # most pixels, and frames, whose codes are kept for a fit of the histograms
+SAMPLED_FRAMES = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +37,8 @@ class FrameStatistics:
     dispersion: float = float("nan")  # of sums of planes: variance in time over that of a binomial; 1 is expected
     sums: int = 0  # frames of sums that the planes came in
     adjacent: Array | None = None  # float64 [2, H, W], sum of code x code of the pixel below, and of that to the right
+    sample: Array | None = None  # codes [t, h, w] of the first frames, of every `stride`-th row and column
+    stride: int = 1
 
     @property
     def pixels(self) -> int:
@@ -103,10 +110,15 @@ def measure(
     stack without frames are refused too.
     """
     _check_light(exposure, photons, name)
-    frames, sums = 0, None
+    frames, sums, stride = 0, None, 1
     histogram = np.zeros(1 << bits, np.int64)
+    sample: list[Array] = []
     for block in blocks:
         codes = as_codes(block, bits, name, frames)
+        if bits > 1 and frames < SAMPLED_FRAMES:
+            stride = ceil(sqrt(codes[0].size / SAMPLED_PIXELS))
+            kept = codes[: SAMPLED_FRAMES - frames, ::stride, ::stride]
+            sample.append(kept.astype(np.uint8 if bits <= 8 else np.uint16))
         histogram += np.bincount(codes.ravel(), minlength=histogram.size)
         values = codes.astype(np.float64)
         if sums is None:
@@ -128,7 +140,18 @@ def measure(
         raise ValueError(f"{name}: has no frames")
     total, square, lagged = sums["total"], sums["square"], sums["lagged"]
     return FrameStatistics(
-        frames, float(exposure), photons, histogram, total, square, lagged, first, previous, adjacent=adjacent
+        frames,
+        float(exposure),
+        photons,
+        histogram,
+        total,
+        square,
+        lagged,
+        first,
+        previous,
+        adjacent=adjacent,
+        sample=np.concatenate(sample) if sample else None,
+        stride=stride,
     )
 
 

@@ -1,10 +1,8 @@
-"""Fits the photon-counting histograms of a QIS by maximum likelihood, and tests the fit by chi-square.
+"""Fits the histograms of a camera's dark and flat frames by maximum likelihood.
 
-Model of a flat field at one light level: pixel p expects lambda (1 + s x_p) electrons and D t dark electrons, where
-x_p is normal with variance 1 and s is the PRNU. All frames of a pixel share x_p, so its codes are not independent. The
-covariance of the fit is therefore the sandwich I^-1 J I^-1, whose J holds that term (White, Econometrica 50, 1982).
-Left out of the fit: a spread of the dark current, of the offset and of the read noise between pixels; lag between
-frames.
+Parameters: ln gain [codes/e-], offset [codes], ln read noise [e-], dark electrons of the longest exposure, and the
+expected electrons of every cell of a flat. Time enters through ratios of exposures only. The covariance is the sandwich
+I^-1 J I^-1 (White, Econometrica 50, 1982); J is summed over pixels, whose codes share light and excess.
 """
 
 from __future__ import annotations
@@ -16,180 +14,294 @@ from math import exp, inf, log, sqrt
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.calibration.frame_statistics import FrameStatistics
-from qsim.calibration.photon_transfer import Transfer
-from qsim.calibration.prnu import normal_nodes
-from qsim.sensor.qis import QIS
+from qsim.calibration.cells import Cell
+from qsim.calibration.code_law import Law, code_law
+from qsim.calibration.goodness import NODES, WEIGHTS, goodness  # noqa: F401  (spad.py takes them from here)
+from qsim.calibration.starts import distinct, starts_of
 
-NODES, WEIGHTS = normal_nodes(5)  # of the PRNU
-LONGEST_STEP = np.array([0.3, 5.0, 1.5])  # in one iteration, of ln gain, offset [codes] and ln read noise
+GAIN, OFFSET, NOISE, DARK = range(4)
+SHARED = 4  # parameters before those of the cells
+BRIGHT = 150.0  # e-; above, an Edgeworth series replaces the sum over electrons, if read noise hides the electrons
+HIDDEN = 0.8  # e- of read noise that hides the electrons
+FINEST = 3.0  # bins in one standard deviation of the read noise
+MOST_BINS = 1200
+STARTS = 4  # that are followed
+FEW_BITS = 6  # up to here a fit is quick, and has more local maxima
+MORE_STARTS = 10
+LEAST_NOISE = 0.05  # codes; less read noise changes no histogram
 
 
 @dataclass(frozen=True, eq=False)
-class HistogramFit:
-    """Fitted parameters [m], their covariance, and the fitted histograms.
+class Panel:
+    """Cells whose codes share bins."""
 
-    Parameters: ln gain [codes/e-], offset [codes], ln read noise [e-], dark current [e-/s], light of every flat [e-].
-    """
-
-    parameters: Array  # [m]
-    information: Array  # [m, m], of the pooled histograms
-    covariance: Array  # [m, m], with the pixels' common factor
-    log_likelihood: float
-    fitted: tuple[Array, ...]  # per stack, probabilities [levels]
+    cells: tuple[int, ...]
+    edges: Array  # [B - 1] highest codes of the bins but the last
+    place: Array  # [levels] bin of a code
+    middle: Array  # [B] code that stands for a bin
+    counts: Array  # [cells, B]
+    smooth: bool
 
 
-def fit_histograms(
-    darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], bits: int, start: Array, prnu_value: float
-) -> HistogramFit:
-    """Maximise the likelihood of the pooled histograms of all stacks, by Fisher scoring with step control.
+@dataclass(frozen=True, eq=False)
+class State:
+    """The likelihood at some parameters."""
 
-    `start` [m] holds the first parameters, `prnu_value` is s of the model.
-    """
-    stacks = [*darks, *flats]
-    parameters = start.copy()
-    shares, jacobians, overdispersion = _model(stacks, len(darks), bits, parameters, prnu_value)
-    best = _log_likelihood(stacks, shares)
-    for _ in range(60):
-        information, score = _information(stacks, shares, jacobians)
-        free = ~((parameters <= _lower_bounds(parameters.size)) & (score <= 0))
-        step = np.zeros_like(parameters)
-        step[free] = np.linalg.lstsq(information[np.ix_(free, free)], score[free], rcond=1e-12)[0]
-        scale, gained = 1.0, 0.0
-        while scale > 1e-4:
-            move = scale * step
-            move[:3] = np.clip(move[:3], -LONGEST_STEP, LONGEST_STEP)
-            trial = np.maximum(parameters + move, _lower_bounds(parameters.size))
-            new = _model(stacks, len(darks), bits, trial, prnu_value)
-            value = _log_likelihood(stacks, new[0])
-            if value >= best:
-                gained, best, parameters = value - best, value, trial
-                shares, jacobians, overdispersion = new
+    parameters: Array
+    value: float
+    score: Array  # [m]
+    information: Array  # [m, m]
+    laws: tuple[Law, ...]
+
+
+class Likelihood:
+    """The likelihood of all cells, as a function of the parameters."""
+
+    def __init__(
+        self, cells: Sequence[Cell], exposures: Sequence[float], darks: int, bits: int, start: Array, *, hidden: bool
+    ) -> None:
+        self.cells, self.bits, self.darks = tuple(cells), bits, darks
+        longest = max(exposures[:darks])
+        self.share = np.array([exposures[c.stack] / longest if c.stack < darks else 0.0 for c in cells])
+        self.dark = np.array([c.stack < darks for c in cells])
+        self.excess = np.array([c.excess for c in cells])
+        self.response = np.ones(len(cells))  # d mean code / d light, relative to the gain
+        self.own = np.where(self.dark, -1, SHARED - 1 + np.cumsum(~self.dark))
+        self.size = SHARED + int(np.count_nonzero(~self.dark))
+        self.panels = tuple(self._panels(start, hidden))
+
+    def _panels(self, start: Array, hidden: bool) -> list[Panel]:
+        """Return one panel of all dim cells, and those of the bright ones: one per stack if no electron shows."""
+        gain, noise = exp(start[GAIN]), exp(start[NOISE])
+        electrons = self.means(start)
+        dim = [i for i, mean in enumerate(electrons) if mean <= BRIGHT]
+        together: dict[tuple[int, int], list[int]] = {}
+        for i, cell in enumerate(self.cells):
+            if i not in dim:  # with an exact sum every bright cell has bins of its own, because its range is short
+                together.setdefault((cell.stack, 0 if hidden else i), []).append(i)
+        panels = [self._panel(dim, gain * noise / FINEST, smooth=False)] if dim else []
+        for members in together.values():
+            step = gain * noise / FINEST
+            if hidden:
+                step = sqrt(min(self.cells[i].variance for i in members)) / 5
+            panels.append(self._panel(members, step, smooth=hidden))
+        return panels
+
+    def _panel(self, members: list[int], step: float, *, smooth: bool) -> Panel:
+        levels = 1 << self.bits
+        seen = np.zeros(levels, np.int64)
+        codes = [self.cells[i].codes.ravel() for i in members]
+        for values in codes:
+            seen += np.bincount(values, minlength=levels)
+        low, high = np.flatnonzero(seen)[[0, -1]]
+        step = max(int(step), 1, -(-(high - low) // MOST_BINS))
+        edges = np.arange(low + step - 1 if low else 0, min(high + step, levels - 1), step)
+        if high == levels - 1:  # saturated codes have a bin of their own
+            edges = np.union1d(edges, [levels - 2])
+        place = np.searchsorted(edges, np.arange(levels))
+        middle = np.concatenate([[edges[0]], (edges[1:] + edges[:-1] + 1) / 2, [edges[-1] + 1]])
+        counts = np.stack([np.bincount(place[v], minlength=len(edges) + 1) for v in codes]).astype(float)
+        return Panel(tuple(members), edges.astype(float), place, middle, counts, smooth)
+
+    def means(self, parameters: Array) -> Array:
+        """Return the expected electrons of all cells."""
+        own = parameters[np.maximum(self.own, SHARED)] if self.size > SHARED else np.zeros(len(self.cells))
+        return np.maximum(np.where(self.dark, self.share * parameters[DARK], own), 1e-9)
+
+    def spreads(self, gain: float, excess: Array | None = None) -> Array:
+        """Return the variance of the expected electrons within the cells."""
+        return np.where(self.dark, 0.0, (self.excess if excess is None else excess) / (gain * self.response) ** 2)
+
+    def laws(self, parameters: Array, excess: Array | None = None) -> tuple[Law, ...]:
+        gain, offset, noise = exp(parameters[GAIN]), float(parameters[OFFSET]), exp(parameters[NOISE])
+        mean, spread = self.means(parameters), self.spreads(gain, excess)
+        return tuple(
+            code_law(
+                panel.edges,
+                gain,
+                offset,
+                noise,
+                mean[list(panel.cells)],
+                spread[list(panel.cells)],
+                smooth=panel.smooth,
+            )
+            for panel in self.panels
+        )
+
+    def value(self, parameters: Array) -> float:
+        """Return the log likelihood."""
+        return sum(
+            float(np.sum(panel.counts * np.log(law.shares)))
+            for panel, law in zip(self.panels, self.laws(parameters), strict=True)
+        )
+
+    def slopes(self, panel: Panel, law: Law, parameters: Array, excess: Array | None = None) -> Array:
+        """Return dP by ln gain, offset, ln read noise, dark electrons and the cell's own mean: [5, cells, B]."""
+        members = list(panel.cells)
+        spread = self.spreads(exp(parameters[GAIN]), excess)[members][:, None]
+        by_gain = law.by_gain - 2 * spread * law.by_spread
+        share, dark = self.share[members][:, None], self.dark[members][:, None]
+        return np.stack([by_gain, law.by_offset, law.by_noise, share * law.by_mean, np.where(dark, 0.0, law.by_mean)])
+
+    def at(self, parameters: Array) -> State:
+        """Return value, score and information at some parameters."""
+        laws = self.laws(parameters)
+        value, score, information = 0.0, np.zeros(self.size), np.zeros((self.size, self.size))
+        for panel, law in zip(self.panels, laws, strict=True):
+            members = list(panel.cells)
+            slope = self.slopes(panel, law, parameters)
+            value += float(np.sum(panel.counts * np.log(law.shares)))
+            pushes = np.einsum("qrb,rb->qr", slope, panel.counts / law.shares)
+            weight = panel.counts.sum(axis=1)[:, None] / law.shares
+            fisher = np.einsum("qrb,rb,prb->qpr", slope, weight, slope, optimize=True)
+            score[:SHARED] += pushes[:SHARED].sum(axis=1)
+            information[:SHARED, :SHARED] += fisher[:SHARED, :SHARED].sum(axis=2)
+            for r, i in enumerate(members):
+                k = self.own[i]
+                if k >= 0:
+                    score[k] += pushes[SHARED, r]
+                    information[k, k] += fisher[SHARED, SHARED, r]
+                    information[:SHARED, k] += fisher[:SHARED, SHARED, r]
+                    information[k, :SHARED] += fisher[:SHARED, SHARED, r]
+        return State(parameters, value, score, information, laws)
+
+    def bounds(self, parameters: Array) -> Array:
+        """Return the lower bounds of the parameters."""
+        return np.array([-inf, -inf, log(LEAST_NOISE) - parameters[GAIN], 0.0, *[1e-6] * (self.size - SHARED)])
+
+    def inside(self, parameters: Array) -> Array:
+        """Return the parameters, moved within their bounds; read noise and light end where no code can vary more."""
+        levels = float(1 << self.bits)
+        gain = min(max(parameters[GAIN], log(levels) - 30), log(levels) + 3)
+        electrons = 10 * levels / exp(gain) + 10
+        top = np.array([gain, 10 * levels, log(electrons), *[electrons] * (self.size - 3)])
+        low = np.array([gain, -10 * levels, log(LEAST_NOISE) - gain, 0.0, *[1e-6] * (self.size - SHARED)])
+        return np.clip(parameters, low, top)
+
+    def maximise(self, start: Array, hold: Array | None = None, rounds: int = 60, enough: float = 1e-5) -> State:
+        """Return the state of largest likelihood by damped Fisher scoring; `hold` [m] @ parameters keeps its value."""
+        state = self.at(self.inside(start))
+        damping = 1e-3
+        for _ in range(rounds):
+            gained, moved, damping = self._step(state, hold, damping)
+            state = moved
+            if gained < enough:
                 break
-            scale /= 4
-        if scale <= 1e-4 or gained < 1e-7:
-            break
-    information, _ = _information(stacks, shares, jacobians)
-    inverse = np.linalg.pinv(information, rcond=1e-13, hermitian=True)
-    meat = information.copy()
-    for stack, jacobian, extra in zip(stacks, jacobians, overdispersion, strict=True):
-        push = jacobian @ extra  # derivative of the score by the common factor of a pixel
-        meat += stack.pixels * stack.frames * (stack.frames - 1) * np.outer(push, push)
-    return HistogramFit(parameters, information, inverse @ meat @ inverse, best, tuple(shares))
+        return state
+
+    def _step(self, state: State, hold: Array | None, damping: float) -> tuple[float, State, float]:
+        """Return the gain in log likelihood of one step, the state after it, and the damping of the next."""
+        low = self.bounds(state.parameters)
+        free = ~((state.parameters <= low) & (state.score <= 0)) & (np.diag(state.information) > 0)
+        if hold is not None:
+            free |= hold != 0  # a held parameter does not move alone
+        scale = 1 / np.sqrt(np.maximum(np.diag(state.information)[free], 1e-12))
+        matrix = state.information[np.ix_(free, free)] * np.outer(scale, scale)
+        push = state.score[free] * scale
+        normal = None if hold is None else hold[free] * scale
+        while damping < 1e7:
+            damped = matrix + damping * np.eye(len(push))
+            solved = np.linalg.solve(damped, push)
+            if normal is not None:
+                along = np.linalg.solve(damped, normal)
+                solved = solved - along * (normal @ solved) / (normal @ along)
+            step = np.zeros(self.size)
+            step[free] = scale * solved
+            step *= min(1.0, 0.2 / max(abs(step[GAIN]), 1e-12), 1.0 / max(abs(step[NOISE]), 1e-12))
+            trial = self.inside(state.parameters + step)
+            held = hold is None or abs(hold @ (trial - state.parameters)) <= 1e-9 * max(abs(hold @ trial), 1e-9)
+            moved = self.at(trial) if held else None
+            if moved is not None and moved.value >= state.value:
+                return moved.value - state.value, moved, max(damping / 10, 1e-9)
+            damping = max(damping * 8, 1e-4)
+        return 0.0, state, 1e-3
+
+    def set_response(self, state: State) -> None:
+        """Take d mean code / d light of every cell from a state: below the gain where codes saturate."""
+        for panel, law in zip(self.panels, state.laws, strict=True):
+            slope = law.by_mean @ panel.middle / exp(state.parameters[GAIN])
+            self.response[list(panel.cells)] = np.clip(slope, 0.05, 2.0)
+
+    def covariance(self, state: State) -> tuple[Array, Array]:
+        """Return the inverse information and the sandwich, both [m, m]; parameters on a bound are left out as known."""
+        pixels = 1 + max(int(cell.pixels.max()) for cell in self.cells)
+        pushes = np.zeros((pixels, self.size))
+        changes = self._by_excess(state.parameters)
+        for panel, law, by_excess in zip(self.panels, state.laws, changes, strict=True):
+            slope = self.slopes(panel, law, state.parameters) / law.shares
+            for r, i in enumerate(panel.cells):
+                cell = self.cells[i]
+                bins = panel.place[cell.codes]
+                tables = slope[:, r]
+                terms = np.stack([table[bins].sum(axis=0) for table in tables])
+                if not self.dark[i]:
+                    terms += by_excess[:, r, None] * (cell.influence / cell.influence.size)
+                    pushes[cell.pixels, self.own[i]] += terms[SHARED]
+                pushes[cell.pixels, :SHARED] += terms[:SHARED].T
+        scale = 1 / np.sqrt(np.maximum(np.diag(state.information), 1e-300))
+        matrix = state.information * np.outer(scale, scale)
+        inverse = np.linalg.pinv(matrix, rcond=1e-12, hermitian=True) * np.outer(scale, scale)
+        meat = pushes.T @ pushes * (pixels / max(pixels - self.size, 1))
+        return inverse, inverse @ meat @ inverse
+
+    def _by_excess(self, parameters: Array) -> list[Array]:
+        """Return the derivative of the score by the excess of every cell, per panel [5, cells]."""
+        step = 1e-3 * np.array([max(cell.variance, 1e-6) for cell in self.cells])
+        found = []
+        for sign in (1, -1):
+            excess = self.excess + sign * step
+            laws = self.laws(parameters, excess)
+            slopes = [
+                np.einsum("qrb,rb->qr", self.slopes(panel, law, parameters, excess), panel.counts / law.shares)
+                for panel, law in zip(self.panels, laws, strict=True)
+            ]
+            found.append(slopes)
+        return [
+            (more - less) / (2 * step[list(panel.cells)]) for panel, more, less in zip(self.panels, *found, strict=True)
+        ]
 
 
-def _lower_bounds(size: int) -> Array:
-    """Return the lower bounds: none for ln gain and offset, 0.01 e- of read noise, 0 for dark current and light."""
-    return np.array([-inf, -inf, log(0.01), *[0.0] * (size - 3)])
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The maximum of the likelihood with the covariance of its parameters."""
+
+    likelihood: Likelihood
+    state: State
+    inverse: Array  # [m, m], inverse information
+    covariance: Array  # [m, m], sandwich
+
+    @property
+    def gain(self) -> float:
+        return exp(self.state.parameters[GAIN])
+
+    @property
+    def noise(self) -> float:
+        return exp(self.state.parameters[NOISE])
 
 
-def sensor_at(parameters: Array, bits: int) -> QIS:
-    """Return the QIS with these parameters [m], without light and dark current."""
-    return QIS(1.0, 0.0, exp(parameters[2]), bits, gain=exp(parameters[0]), offset=float(parameters[1]))
+def fit_cells(cells: Sequence[Cell], exposures: Sequence[float], darks: int, bits: int) -> Fit:
+    """Fit all cells, from the likeliest of several starts; `exposures` of the stacks, darks first."""
+    longest = max(exposures[:darks])
+    share = np.array([exposures[cell.stack] / longest for cell in cells])
+    starts = starts_of(cells, share, darks)
+    first = starts.points[0].copy()
+    first[NOISE] = log(starts.noise)
+    likelihood = Likelihood(cells, exposures, darks, bits, first, hidden=starts.hidden)
+    values = [likelihood.value(likelihood.inside(point)) for point in starts.points]
+    count = STARTS if bits > FEW_BITS else MORE_STARTS
+    rough = [likelihood.maximise(point, rounds=12, enough=0.1) for point in distinct(starts.points, values, count)]
+    best = max(rough, key=lambda state: state.value)
+    likelihood.set_response(best)
+    best = likelihood.maximise(best.parameters)
+    hidden = starts.hidden and exp(best.parameters[NOISE]) > HIDDEN
+    likelihood = Likelihood(cells, exposures, darks, bits, best.parameters, hidden=hidden)
+    return refined(likelihood, best)
 
 
-def _arrivals(stacks: Sequence[FrameStatistics], darks: int, parameters: Array, s: float) -> tuple[Array, Array, Array]:
-    """Return expected electrons at the nodes of the PRNU [stack, node], the weights and the factors of the light."""
-    dark = np.array([parameters[3] * stack.exposure for stack in stacks])
-    light = np.concatenate([np.zeros(darks), parameters[4:]])
-    nodes, weights = (NODES, WEIGHTS) if s > 0 else (np.zeros(1), np.ones(1))
-    return np.maximum(dark[:, None] + light[:, None] * (1 + s * nodes), 0.0), weights, 1 + s * nodes
-
-
-def _mix(table: Array, weights: Array) -> Array:
-    """Return the weighted mean over nodes: [stack, node, levels] -> [stack, levels]."""
-    return np.tensordot(table, weights, axes=([1], [0]))
-
-
-def _shares(stacks: Sequence[FrameStatistics], darks: int, bits: int, parameters: Array, s: float) -> Array:
-    """Return P(code) of every stack, [stack, levels]."""
-    arrivals, weights, _ = _arrivals(stacks, darks, parameters, s)
-    return _mix(np.exp(sensor_at(parameters, bits).log_pmf(arrivals, 1.0)), weights)
-
-
-def _model(
-    stacks: Sequence[FrameStatistics], darks: int, bits: int, parameters: Array, s: float
-) -> tuple[Array, list[Array], list[Array]]:
-    """Return per stack: P(code) [levels], d log P / d parameters [m, levels], and s lambda dP/dlambda [levels]."""
-    shares = _shares(stacks, darks, bits, parameters, s)
-    arrivals, weights, factors = _arrivals(stacks, darks, parameters, s)
-    derivatives = np.zeros((parameters.size, *shares.shape))
-    for i in range(3):  # gain, offset, read noise: central differences of the exact probabilities
-        small = np.zeros_like(parameters)
-        small[i] = 1e-5
-        more, less = (_shares(stacks, darks, bits, parameters + sign * small, s) for sign in (1, -1))
-        derivatives[i] = (more - less) / 2e-5
-    slope = np.diff(sensor_at(parameters, bits).dcdf(arrivals, 1.0), axis=-1, prepend=0.0)
-    by_dark, by_light = _mix(slope, weights), _mix(slope, weights * factors)
-    derivatives[3] = by_dark * np.array([[stack.exposure] for stack in stacks])
-    for i in range(len(stacks) - darks):
-        derivatives[4 + i, darks + i] = by_light[darks + i]
-    jacobians = np.moveaxis(derivatives, 1, 0) / np.maximum(shares, 1e-300)[:, None, :]
-    light = np.concatenate([np.zeros(darks), parameters[4:]])
-    return shares, list(jacobians), list(s * light[:, None] * by_dark)
-
-
-def _log_likelihood(stacks: Sequence[FrameStatistics], shares: Sequence[Array] | Array) -> float:
-    """Return the log-likelihood of the histograms of all stacks, given P(code)."""
-    return sum(
-        float(np.sum(np.where(s.histogram > 0, s.histogram * np.log(np.maximum(p, 1e-300)), 0.0)))
-        for s, p in zip(stacks, shares, strict=True)
-    )
-
-
-def _information(
-    stacks: Sequence[FrameStatistics], shares: Sequence[Array] | Array, jacobians: Sequence[Array]
-) -> tuple[Array, Array]:
-    """Return the Fisher information of the pooled histograms [m, m] and the score [m]."""
-    size = jacobians[0].shape[0]
-    information, score = np.zeros((size, size)), np.zeros(size)
-    for stack, p, jacobian in zip(stacks, shares, jacobians, strict=True):
-        n = stack.histogram.sum()
-        information += n * (jacobian * p) @ jacobian.T
-        score += jacobian @ (stack.histogram - n * p)
-    return information, score
-
-
-def goodness(
-    stacks: Sequence[FrameStatistics], shares: Sequence[Array], fitted: int
-) -> tuple[float, tuple[Array, ...]]:
-    """Return the chi-square p-value of histograms against fitted shares, and residuals per level in sigmas.
-
-    Bins with an expectation below 5 are pooled. The common factor of a pixel acts on the codes like a change of light,
-    which is fitted; the test therefore keeps its level.
-    """
-    from scipy.stats import chi2
-
-    total, freedom, residuals = 0.0, -fitted, []
-    for stack, share in zip(stacks, shares, strict=True):
-        expected = share * stack.histogram.sum()
-        residuals.append((stack.histogram - expected) / np.sqrt(np.maximum(expected, 1.0)))
-        observed_bins, expected_bins = _pooled(stack.histogram, expected)
-        total += float(np.sum((observed_bins - expected_bins) ** 2 / expected_bins))
-        freedom += len(expected_bins) - 1
-    return (float(chi2.sf(total, freedom)) if freedom > 0 else float("nan")), tuple(residuals)
-
-
-def _pooled(observed: Array, expected: Array, least: float = 5.0) -> tuple[Array, Array]:
-    """Join neighbouring bins until each expects at least `least`; return observed and expected counts."""
-    last = max(observed.sum() // least - 1, 0)  # whole counts: rounding of the expected sum must not join two bins
-    group = np.minimum(np.floor(np.cumsum(expected) / least), last).astype(int)
-    _, group = np.unique(group, return_inverse=True)
-    return np.bincount(group, observed), np.bincount(group, expected)
-
-
-def best_fit(
-    darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], bits: int, transfer: Transfer, s: float
-) -> HistogramFit:
-    """Fit from the likeliest of a few starts: with resolved peaks, a gain off by one peak is a local maximum."""
-    reach = min(3 * sqrt(transfer.gain_variance) / transfer.gain, 0.3)
-    read = sqrt(max(transfer.read_variance, 0.05**2))
-    stacks = [*darks, *flats]
-    starts = []
-    for shift in np.linspace(-reach, reach, 9):
-        gain = transfer.gain * (1 + shift)
-        dark = max(transfer.dark_current, 1e-9)
-        lights = [max((flat.mean - transfer.offset) / gain - dark * flat.exposure, 1e-3) for flat in flats]
-        starts.append(np.array([log(gain), transfer.offset, log(read), dark, *lights]))
-    likelihoods = [_log_likelihood(stacks, _shares(stacks, len(darks), bits, start, s)) for start in starts]
-    return fit_histograms(darks, flats, bits, starts[int(np.argmax(likelihoods))], s)
+def refined(likelihood: Likelihood, start: State) -> Fit:
+    """Return the fit at the maximum near a state."""
+    best = start
+    for _ in range(2):
+        likelihood.set_response(likelihood.at(best.parameters))
+        best = likelihood.maximise(best.parameters, enough=1e-10)
+    return Fit(likelihood, best, *likelihood.covariance(best))

@@ -1,0 +1,51 @@
+"""Tests fitted histograms by chi-square."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.calibration.frame_statistics import FrameStatistics
+from qsim.calibration.prnu import normal_nodes
+
+NODES, WEIGHTS = normal_nodes(5)  # of a PRNU
+
+
+def goodness(
+    stacks: Sequence[FrameStatistics], shares: Sequence[Array], fitted: int
+) -> tuple[float, tuple[Array, ...]]:
+    """Return the chi-square p-value of histograms against fitted shares, and residuals per level in sigmas.
+
+    The common factor of a pixel acts on the codes like a change of light, which is fitted; the test therefore keeps its
+    level.
+    """
+    expected = [share * stack.histogram.sum() for stack, share in zip(stacks, shares, strict=True)]
+    pairs = [(stack.histogram, counts) for stack, counts in zip(stacks, expected, strict=True)]
+    residuals = [(observed - counts) / np.sqrt(np.maximum(counts, 1.0)) for observed, counts in pairs]
+    return chi_square(pairs, fitted), tuple(residuals)
+
+
+def chi_square(histograms: Iterable[tuple[Array, Array]], fitted: int) -> float:
+    """Return the p-value of (observed, expected) histograms with so many `fitted` parameters; NaN without freedom.
+
+    Bins with an expectation below 5 are pooled.
+    """
+    from scipy.stats import chi2
+
+    total = 0.0
+    freedom = -fitted
+    for observed, expected in histograms:
+        observed_bins, expected_bins = pooled(observed, expected)
+        total += float(np.sum((observed_bins - expected_bins) ** 2 / expected_bins))
+        freedom += len(expected_bins) - 1
+    return float(chi2.sf(total, freedom)) if freedom > 0 else float("nan")
+
+
+def pooled(observed: Array, expected: Array, least: float = 5.0) -> tuple[Array, Array]:
+    """Join neighbouring bins until each expects at least `least`; return observed and expected counts."""
+    last = max(observed.sum() // least - 1, 0)  # whole counts: rounding of the expected sum must not join two bins
+    group = np.minimum(np.floor(np.cumsum(expected) / least), last).astype(int)
+    _, group = np.unique(group, return_inverse=True)
+    return np.bincount(group, observed), np.bincount(group, expected)

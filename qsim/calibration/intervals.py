@@ -1,0 +1,151 @@
+"""Makes 95 % intervals from the profile of the likelihood, scaled to the covariance between pixels.
+
+A parameter is held at a value and all others are fitted again. Its signed root sqrt(2 (log L_max - log L) / scale) is
+normal; scale is the variance of the sandwich over that of the information (Pace et al., Statistica Sinica 21, 2011).
+Where the likelihood is a parabola this is the interval of the standard error. Near the bound of a parameter, which
+cannot be negative, the limits of the root are those of Feldman and Cousins (Phys. Rev. D 57, 1998). The interval then
+holds the truth in 95 and not in 97.5 of 100 cases.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, isfinite, log, sqrt
+
+from numpy import ndarray as Array
+
+from qsim.calibration.histogram_fit import GAIN, NOISE, OFFSET, Fit, State
+from qsim.calibration.results import Z95
+
+ONE_SIDED = 1.645  # root of the one-sided limit, at the bound
+RISE = 0.18  # of the limit of the root per standard deviation from the bound, until it is Z95
+CLOSE = 0.03  # to which the root is met, relative
+SHARP = 0.5  # codes of read noise; below, the likelihood has several maxima
+TRIED = (0.1, 0.3)  # codes of read noise, or of the offset from -0.2
+HIGHER = 0.02  # of a log likelihood; less is the error of a maximum
+
+
+@dataclass(frozen=True)
+class Interval:
+    value: float
+    low: float
+    high: float
+    parabola: bool  # whether the likelihood is one between the ends
+
+
+def profile(fit: Fit, direction: Array, step: float, farthest: float, *, bound: float = -inf) -> Interval:
+    """Return the interval of direction [m] @ parameters. `bound` is the value that cannot be passed.
+
+    `step` is the first step where the standard error is larger. An end further than `farthest` away is infinite.
+    """
+    value = float(direction @ fit.state.parameters)
+    variance = float(direction @ fit.covariance @ direction)
+    naive = float(direction @ fit.inverse @ direction)
+    scale = min(max(variance / naive, 0.3), 10.0) if naive > 0 and variance > 0 else 1.0
+    error = sqrt(variance) if variance > 0 and isfinite(variance) else inf
+    error = min(error, step)
+    search = _Search(fit, direction, scale, value, error, farthest)
+    at_bound = value - bound < 1e-9 * max(abs(value), 1.0) if isfinite(bound) else False
+    if at_bound:
+        high, _ = search.end(1, ONE_SIDED + RISE * 0.9, inf)
+        return Interval(value, bound, high, False)
+    target = Z95
+    if isfinite(bound) and value - 4.5 * error < bound:
+        root = search.root(bound)
+        if root < ONE_SIDED:
+            high, _ = search.end(1, Z95, inf)
+            return Interval(value, bound, high, False)
+        target = min(Z95, (ONE_SIDED + RISE * root) / (1 + RISE))
+    low, first = search.end(-1, target, bound)
+    high, second = search.end(1, Z95, inf)
+    return Interval(value, low, high, first and second)
+
+
+class HigherMaximum(Exception):
+    """A profile met a larger likelihood than that of the fit, which is therefore to be repeated from `state`."""
+
+    def __init__(self, state: State) -> None:
+        super().__init__("the fit was a local maximum")
+        self.state = state
+
+
+class _Search:
+    """The signed root of the likelihood along one direction of the parameters."""
+
+    def __init__(self, fit: Fit, direction: Array, scale: float, value: float, error: float, farthest: float) -> None:
+        self.fit, self.direction, self.scale = fit, direction, scale
+        self.value, self.error, self.farthest = value, error, farthest
+        along = fit.inverse @ direction
+        size = float(direction @ along)
+        self.along = along / size if size > 0 else direction / float(direction @ direction)
+        self.last: State = fit.state
+
+    def root(self, at: float) -> float:
+        """Return the root at a value of the parameter, above 0 on both sides."""
+        state = max((self._held(start) for start in self._starts(at)), key=lambda state: state.value)
+        self.last = state
+        if state.value > self.fit.state.value + HIGHER:
+            raise HigherMaximum(state)
+        return sqrt(max(2 * (self.fit.state.value - state.value), 0.0) / self.scale)
+
+    def _starts(self, at: float) -> list[Array]:
+        """Return parameters with the value `at`, from which the others are fitted; several where maxima are many."""
+        near = self.last.parameters
+        found = [near + self.along * (at - float(self.direction @ near))]
+        if self.fit.gain * self.fit.noise > SHARP:
+            return found
+        best = self.fit.state.parameters
+        for base in (near, best):
+            plain = base + self.direction * (at - float(self.direction @ base)) / float(self.direction @ self.direction)
+            found.append(plain)
+        for change in TRIED:
+            other = found[-1].copy()
+            if self.direction[NOISE] == 0:
+                other[NOISE] = log(change) - other[GAIN]
+            else:
+                other[OFFSET] += change - 0.2
+            found.append(other)
+        return found
+
+    def _held(self, start: Array) -> State:
+        """Return the fit from a start with the value of the parameter kept."""
+        at = float(self.direction @ start)
+        moved = self.fit.likelihood.inside(start)
+        moved = moved + self.direction * ((at - float(self.direction @ moved)) / float(self.direction @ self.direction))
+        return self.fit.likelihood.maximise(moved, hold=self.direction, rounds=25, enough=2e-3)
+
+    def end(self, side: int, target: float, bound: float) -> tuple[float, bool]:
+        """Return the value where the root is `target`, and whether it lies at `target` standard errors."""
+        self.last = self.fit.state
+        near, at_near = self.value, 0.0
+        far = self.value + side * target * self.error
+        if side < 0:
+            far = max(far, bound)
+        for count in range(20):
+            found = self.root(far)
+            if abs(found / target - 1) < CLOSE:
+                return self.value + (far - self.value) * target / found, count == 0
+            if found > target:
+                break
+            if far == bound:
+                return bound, False
+            if abs(far - self.value) > self.farthest:
+                return side * inf, False
+            near, at_near = far, found
+            far = self.value + (far - self.value) * min(max(1.1 * target / max(found, 1e-3), 1.2), 3.0)
+            if side < 0:
+                far = max(far, bound)
+        else:
+            return side * inf, False
+        at_far = found
+        for _ in range(12):
+            share = (target - at_near) / (at_far - at_near)
+            middle = near + (far - near) * min(max(share, 0.08), 0.92)
+            found = self.root(middle)
+            if abs(found / target - 1) < CLOSE:
+                return middle, False
+            if found < target:
+                near, at_near = middle, found
+            else:
+                far, at_far = middle, found
+        return far, False

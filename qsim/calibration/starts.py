@@ -1,0 +1,148 @@
+"""Chooses the points from which a fit of histograms starts.
+
+Variance over mean of the cells gives a first gain. If single electrons show as peaks, the Fourier transform of the
+codes at 1/gain gives gain, read noise and offset sharply; the offset is then known up to whole electrons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import exp, log, pi, sqrt
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.calibration.cells import Cell
+
+SHIFTS = (1.0, 0.97, 1.03, 0.94, 1.06, 0.9, 1.1, 0.8, 1.2, 0.65, 1.4)  # of the first gain, where no peak shows
+NOISES = (0.1, 0.2, 0.35, 0.6)  # e-
+COMB = 1.05  # codes/e-; above, the transform may show electrons
+FINE = 2.0  # codes/e-; above, it shows how wide they are
+PADDING = 8  # of the Fourier transform
+CLEAR = 6.0  # standard errors of a peak
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """Electron peaks: gain [codes/e-], read noise [e-], and the offset [codes] up to whole electrons."""
+
+    gain: float
+    noise: float
+    offset: float
+
+
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """First parameters, the most likely kind first; `hidden`: the read noise hides the electrons."""
+
+    points: list[Array]
+    noise: float  # e-, for the width of the bins
+    hidden: bool
+
+
+def starts_of(cells: Sequence[Cell], share: Array, darks: int) -> Starts:
+    """Return the starts of a fit. `share` [cells] is the exposure of dark cells relative to the longest."""
+    gain = first_gain(cells)
+    peaks = electron_peaks([cell for cell in cells if cell.stack >= darks], gain)
+    dark = [i for i, cell in enumerate(cells) if cell.stack < darks]
+    shortest = min(dark, key=lambda i: share[i])
+    longest = max(dark, key=lambda i: share[i])
+    variance = max(cells[shortest].variance - 1 / 12, 1e-4)  # codes^2
+    several = share[shortest] < share[longest]
+    points: list[Array] = []
+
+    def add(gain: float, offset: float, noise: float, electrons: float) -> None:
+        light = [max((cell.mean - offset) / gain, 1e-3) for cell in cells if cell.stack >= darks]
+        points.append(np.array([log(gain), offset, log(noise), max(electrons, 1e-4), *light]))
+
+    for shift in (1.0, 0.998, 1.002):
+        if peaks is None:
+            break
+        phase = peaks.offset
+        base = cells[shortest].mean
+        at = peaks.gain * shift
+        offset = phase + at * np.floor((base - phase) / at + 0.5)
+        for back in range(int(2 + 2 * variance / at**2 + 3 * sqrt(variance) / at)):
+            electrons = max((base - offset) / at + back, 0.0) / share[shortest]
+            if several:
+                electrons = (cells[longest].mean - base) / at / (share[longest] - share[shortest])
+            add(at, offset - back * at, peaks.noise, electrons)
+    hidden = peaks is None and sqrt(variance) / gain > 1.2
+    few = (1.0,) if points else (1.0, 0.93, 1.07) if hidden else SHIFTS
+    for shift in SHIFTS if gain < FINE and not hidden else few:
+        at = gain * shift
+        total = variance / at**2
+        if several:
+            guesses = [(cells[longest].mean - cells[shortest].mean) / at / (share[longest] - share[shortest])]
+        else:
+            guesses = [0.003 * total, 0.3 * total, 0.8 * total]
+        for electrons in guesses:
+            rest = sqrt(max(total - electrons * share[shortest], 0.01))
+            tried = () if hidden else NOISES if gain < 2 * FINE else (0.35, 0.6)
+            for noise in {*tried, rest}:
+                add(at, cells[shortest].mean - at * electrons * share[shortest], noise, electrons)
+    visible = peaks.noise if peaks else 0.35 if gain >= FINE else 0.15
+    return Starts(points, sqrt(variance) / gain if hidden else visible, hidden)
+
+
+def first_gain(cells: Sequence[Cell]) -> float:
+    """Return the slope of variance over mean of the cells, codes/e-."""
+    mean = np.array([cell.mean for cell in cells])
+    variance = np.array([cell.variance for cell in cells])
+    weight = np.sqrt([cell.codes.size for cell in cells]) / np.maximum(variance, 0.05)
+    design = np.stack([np.ones_like(mean), mean], axis=1)
+    slope = float(np.linalg.lstsq(design * weight[:, None], variance * weight, rcond=None)[0][1])
+    if slope > 0:
+        return slope
+    return max(float(variance.max() / max(np.ptp(mean), 1e-9)), 1e-6)
+
+
+def electron_peaks(cells: Sequence[Cell], gain: float) -> Peaks | None:
+    """Return the electron peaks near a gain; None if none show. The codes' transform at 1/gain is exp(-2 pi^2 noise^2).
+
+    It is a local maximum over frequency, because the Poisson law is one at whole turns.
+    """
+    if gain < COMB:
+        return None
+    highest = max(int(cell.codes.max()) for cell in cells) + 1
+    histogram = np.sum([np.bincount(cell.codes.ravel(), minlength=highest) for cell in cells], axis=0)
+    share = histogram / histogram.sum()
+    size = 1 << int(np.ceil(np.log2(max(PADDING * highest, 1024))))
+    size_of = np.abs(np.fft.fft(share, size))
+    first, last = int(size / (1.4 * gain)), min(int(size / (0.7 * gain)) + 1, int(0.97 * size))
+    inner = size_of[first:last]
+    if len(inner) < 3:
+        return None
+    local = np.flatnonzero((inner[1:-1] > inner[:-2]) & (inner[1:-1] > inner[2:])) + 1
+    if len(local) == 0:
+        return None
+    best = int(local[np.argmax(inner[local])])
+    height = float(inner[best])
+    if height < CLEAR / sqrt(histogram.sum()):
+        return None
+    left, right = inner[best - 1], inner[best + 1]
+    turn = 0.5 * (left - right) / (left - 2 * height + right)
+    frequency = (first + best + turn) / size
+    codes = np.arange(highest)
+    value = complex(share @ np.exp(2j * pi * frequency * codes))
+    found = 1 / frequency
+    left_by_rounding = float(np.sinc(frequency))
+    noise = sqrt(max(-log(max(abs(value) / left_by_rounding, 1e-12)) / (2 * pi**2), 0.06**2))
+    return Peaks(found, noise, float(np.angle(value) / (2 * pi) * found) % found)
+
+
+def distinct(points: Sequence[Array], values: Sequence[float], count: int) -> list[Array]:
+    """Return the `count` likeliest points that differ in gain, offset or read noise."""
+    kept: list[Array] = []
+    for i in np.argsort(values)[::-1]:
+        point = points[i]
+        near = any(
+            abs(point[0] - p[0]) < 0.005 and abs(point[1] - p[1]) < 0.25 * exp(p[0]) and abs(point[2] - p[2]) < 0.3
+            for p in kept
+        )
+        if not near:
+            kept.append(point)
+        if len(kept) == count:
+            break
+    return kept
