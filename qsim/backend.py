@@ -192,7 +192,8 @@ def run_probe(variant: str, library: str | None) -> Probe:
     except subprocess.TimeoutExpired:
         return Probe(backend, library, False, f"{NO_FRAME} {PROBE_SECONDS} s")
     numbers = re.search(r"^version (\d+)$", child.stdout, re.MULTILINE)
-    if child.returncode == 0 and child.stdout.rstrip().endswith("rendered"):
+    # Mitsuba's own lines may stand before it, or after it where Python keeps what it prints (no PYTHONUNBUFFERED).
+    if child.returncode == 0 and re.search(r"rendered$", child.stdout, re.MULTILINE):
         return Probe(backend, library, True, f"LLVM {numbers.group(1)}" if numbers else "CUDA with OptiX")
     lines = [line.strip() for line in (child.stderr + "\n" + child.stdout).splitlines() if line.strip()]
     errors = [line for line in lines if "ERROR" in line.upper()]  # the last: start-up files of Python may print others

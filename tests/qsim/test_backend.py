@@ -212,3 +212,19 @@ def test_a_user_without_a_home_tests_in_every_process(monkeypatch):
     monkeypatch.setattr(backend, "run_probe", lambda variant, path: backend.Probe("llvm", path, True, "LLVM 19"))
     with pytest.warns(RuntimeWarning, match="this user has no home; set XDG_CACHE_HOME"):
         assert backend.cached_probe("llvm_ad_mono", sys.executable).works
+
+
+@pytest.mark.parametrize(
+    ("printed", "works"),
+    [
+        ("version 23\nWARN [HDRFilm] grey\n\x1b[0mrendered\n", True),
+        ("version 23\nrendered\nWARN [HDRFilm] grey\n\x1b[0m", True),
+        ("version 23\nrendered a mean of 0.0\n", False),
+        ("version 23\n", False),
+    ],
+)
+def test_the_lines_of_mitsuba_may_stand_before_or_after_the_answer(monkeypatch, printed, works):
+    """Python keeps what it prints until it ends, unless PYTHONUNBUFFERED is set; the fast renderer seemed to fail."""
+    child = subprocess.CompletedProcess([], 0, stdout=printed, stderr="")
+    monkeypatch.setattr(backend.subprocess, "run", lambda *args, **options: child)
+    assert backend.run_probe("llvm_ad_mono", "libLLVM.so.23.1").works == works
