@@ -15,6 +15,7 @@ from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
+from qsim.formats.recording import Recording
 
 PICTURES = ("mp4", "png", "nerfstudio")  # kinds that show light through a transfer curve
 _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs", ".dat": "spike", ".npz": "photons"}
@@ -164,8 +165,6 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
     with bar("converting") as progress:
         for source, target in pairs or [(args.input, args.output)]:
             recording = importing.read(source, hints)
-            if recording.reading:
-                note(f"{source}: {recording.reading}")
             rate = args.frame_rate or recording.frame_rate
             if rate is None:
                 raise ValueError(f"{args.input}: files do not state the capture rate; add --frame-rate, as in 2000")
@@ -181,10 +180,18 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
                 made.append(
                     (clip.path, f"{_size(clip)}, light of {recording.source}; {importing.saturation_line(clip)}")
                 )
+                _tell_reading(source, recording)
                 continue
             stream = importing.to_stream(recording, target, capture, force=args.force, progress=progress)
             made.append((stream.path, f"{_size(stream)}, {stream.bits}-bit codes, {recording.source}"))
+            _tell_reading(source, recording)
     return made
+
+
+def _tell_reading(source: Path, recording: Recording) -> None:
+    """Print how the bytes or axes of a file that was converted were read."""
+    if recording.reading:
+        note(f"{source}: {recording.reading}")
 
 
 def _check_names(folder: Path, pairs: list[tuple[Path, Path]]) -> None:
