@@ -77,6 +77,11 @@ def _run_tradeoff(args: argparse.Namespace) -> int:
         refuse_idle(args, "tradeoff --paper-figure", [*TABLE_ONLY, *OF_STUDIES])
     elif args.source is None:
         raise ValueError("give a clip or a scene, --table, or --paper-figure; see qsim tradeoff --help")
+    if args.read_noise is not None:
+        raise ValueError(
+            f"--read-noise {args.read_noise:g}: is of --table; a clip or scene is seen by a sensor, so state it in a "
+            "sensor file (read_noise in [sensor]) and give that with --sensor"
+        )
     refuse_idle(args, "tradeoff of a clip or scene", TABLE_ONLY)
     if args.source is not None and (Path(args.source) / "clip.json").is_file():
         refuse_idle(args, "tradeoff of a clip", ["size", "base_fps", "frames"])

@@ -142,15 +142,20 @@ class Forecast:
             )
             for cost in self.costs
         ]
-        day = max(1, math.ceil(self.hours / 24))
+        clips = sum(cost.clips for cost in self.costs)  # a clip is made by one machine
+        busy = min(machines, clips)
+        each = max(self.hours / busy, *(cost.hours / cost.clips for cost in self.costs))
+        idle = f"; {busy} of {machines} have work, because a clip is not split" if busy < machines else ""
+        day = min(max(1, math.ceil(self.hours / 24)), clips)
         faster = f", or one that is {self.hours / 24:.2g} times as fast" if day > 1 else ""
         return [
             *text_table(rows, header),
             f"in all: {self.hours:.3g} hours on this machine ({self.engine}, one worker; "
             f"{self.processor_hours:.3g} hours of processor time), {self.gigabytes:.3g} GB, "
             f"{self.peak_memory:.2g} GiB of memory per worker",
-            f"{_machines(machines)} like this: {self.hours / machines:.3g} hours{' each' if machines > 1 else ''}"
-            + (", by --shard or --cluster" if machines > 1 else ""),
+            f"{_machines(machines)} like this: {each:.3g} hours{' each' if machines > 1 else ''}"
+            + (", by --shard or --cluster" if machines > 1 else "")
+            + idle,
             f"within a day: {_machines(day)} like this{faster}"
             + ("" if on_gpu(self.engine) else "; run this command on a machine with a GPU to have that measured"),
         ]

@@ -13,6 +13,7 @@ from qsim.formats import array_files, hdf5, images, mat_files, photon_times, raw
 from qsim.formats.recording import Hints, Recording
 
 Reader = Callable[[Path, Hints], Recording]
+SMOOTH = 1.5  # roughness below which a layout may be right, and how much rougher the next one must then be
 LAYOUTS: dict[str, Reader] = {  # the names of --layout
     "cube": array_files.read_cube,
     "codes": array_files.read_codes_npy,
@@ -202,10 +203,12 @@ def _detect_raw(path: Path, many: bool = False) -> str:
         raise ValueError(
             f"{path}: {size} bytes fit none of {', '.join(candidates)}; the file is truncated, or another kind"
         )
-    evidence = []
+    evidence, found = [], []
     for name in fitting:
         sample = LAYOUTS[name](path, Hints()).read(0, min(64, size // raw_cameras.RAW_FRAME) or 1)
-        evidence.append(f"{name} (roughness {raw_cameras.roughness(sample):.2f})")
-    raise ValueError(
-        f"{path}: {size} bytes fit {', '.join(evidence)}; choose one with --layout (the right one is usually near 1)"
-    )
+        found.append(raw_cameras.roughness(sample))
+        evidence.append(f"{name} (roughness {found[-1]:.2f})")
+    least, second = sorted(found)[:2]
+    clear = least < SMOOTH and second > SMOOTH * least
+    tells = "the right one is usually near 1" if clear else "these frames are too noisy or too rough to tell"
+    raise ValueError(f"{path}: {size} bytes fit {', '.join(evidence)}; choose one with --layout ({tells})")
