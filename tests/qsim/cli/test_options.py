@@ -59,6 +59,19 @@ WORDS = {  # a line that each parser takes
     "validate": "validate reading",
     "completion": "completion bash",
 }
+# Values of reading options that a .npy of codes, and the stacks of a calibration, refuse: they have their own layout.
+LAYOUTS = {
+    "order": "msb",
+    "endian": "little",
+    "skip-bytes": "3",
+    "row-padding": "2",
+    "channel": "1",
+    "slice": "1",
+    "dataset": "a",
+    "variable": "b",
+    "height": "4",
+    "width": "4",
+}
 VALIDATE = {"output": "x.png", "pixels": "65536", "scenes": "fan", "height": "24", "width": "32", "psnr": "30"}
 
 
@@ -335,6 +348,20 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused(CODES, "--white 0.5", "--white"),
     ],
     ("convert", "--force"): [Acts(f"{CODES} --flip ud", "--force", codes=(0, 2), before=CODES)],
+    ("convert", "--axes"): [
+        Acts(CODES, "--axes HTW"),
+        Refused("convert clip e.mp4", "--axes TYX", "--axes"),
+    ],
+    ("convert", "--black"): [Acts(LIGHT, "--black 0.25"), Refused(CODES, "--black 0.25", "--black")],
+    ("convert", "--keep-gaps"): [Refused(CODES, "--keep-gaps", "--keep-gaps")],
+    **{
+        ("convert", f"--{name}"): [
+            Refused(CODES, f"--{name} {value}", f"--{name}"),
+            Refused("convert clip e.mp4", f"--{name} {value}", f"--{name}"),
+        ]
+        for name, value in LAYOUTS.items()
+        if name in ("order", "endian", "skip-bytes", "row-padding", "slice", "dataset")
+    },
     # preview, report
     ("preview", "--output"): [Acts("preview clip", "-o p.png", names)],
     ("preview", "--what"): [
@@ -457,7 +484,6 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         ),
         Refused(QIS.replace("calibrate", "calibrate --model qis"), "--planes 50", "--planes"),
     ],
-    ("calibrate", "--variable"): [Refused(CALIBRATE, "--variable b", "--variable")],
     ("calibrate", "--model"): [Refused("calibrate --bits 8 --static counts.npy 1e-5 -o s.toml", "--model qis", "qis")],
     ("calibrate", "--paralyzable"): [
         Refused(CALIBRATE, "--paralyzable", "dead time"),
@@ -467,7 +493,9 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused(QIS, "--ignore-dead-time", "spad"),
         Refused(CALIBRATE, "--ignore-dead-time", "dead"),
     ],
-    ("calibrate", "--width"): [Refused(QIS, "--width 4", "--width")],
+    ("calibrate", "--layout"): [Refused(QIS, "--layout cube", "cube")],
+    ("calibrate", "--axes"): [Refused(QIS, "--axes HTWC", "axes")],
+    **{("calibrate", f"--{name}"): [Refused(QIS, f"--{name} {value}", f"--{name}")] for name, value in LAYOUTS.items()},
     ("calibrate", "--output"): [Acts(CALIBRATE, "-o new.toml", names), Refused(CALIBRATE, "-o t.txt", ".toml")],
     ("calibrate", "--force"): [Acts(CALIBRATE, "--force", exit_code, codes=(0, 2), before=CALIBRATE)],
     # validate
