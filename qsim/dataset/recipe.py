@@ -39,6 +39,7 @@
     row_order = "down"         # order of rows: down, the default, or up; of columns: right or left
     exposures = [1.0, 0.25]    # shares of a code's time with light, in turn; default: all of it
     colour = "rggb"            # colour filters: rggb, quad, rgbw or a .toml with [colour]; default: the sensor's
+    temperature = 25.0         # degrees C, by a law of the sensor file (dark_doubling); default: that of the file
 
 A (family, seed) belongs to one split at every speed, and a family of the test split to no other split.
 """
