@@ -24,7 +24,7 @@ photons" means that light is to be given as photons that this sensor detects. A 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -289,7 +289,7 @@ def from_toml(path: str | Path, bits: int | None = None, conditions: Conditions 
             raise ValueError(f"{path}: unknown table [{key}]{suggest(key, TABLES)}")
     if not isinstance(tables.get("sensor"), dict):
         raise ValueError(f"{path}: a table [sensor] with model, bits and the model's fields is missing")
-    if "bits" not in tables["sensor"]:
+    if "bits" not in tables["sensor"] and not _has_one_depth(tables["sensor"].get("model")):
         if bits is None:
             raise ValueError(f"{path}: states no bits, so it serves every depth; say which one, as in --bits 3")
         tables["sensor"]["bits"] = bits
@@ -350,6 +350,12 @@ def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:
         raise ValueError(f"{where}: model is one of {', '.join(MODELS)}, got {name!r}{suggest(str(name), MODELS)}")
     values = {key: value for key, value in settings.items() if key != "model"}
     return make(MODELS[name], values, where)
+
+
+def _has_one_depth(model: object) -> bool:
+    """Return whether a model's codes have one depth, which its files need not state: a default of the class."""
+    own = fields(MODELS[model]) if isinstance(model, str) and model in MODELS else ()  # type: ignore[arg-type]
+    return any(field.name == "bits" and field.default is not MISSING for field in own)
 
 
 def is_known(sensor: Sensor) -> bool:

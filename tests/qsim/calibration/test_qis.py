@@ -100,7 +100,8 @@ def test_saturated_flats_are_refused_or_announced():
     planes[:, :3] = 1
     found = calibrate_spad([dark], [statistics_of(planes, 1, 3.0)], bits=1)
     assert any("saturated in every frame" in words for words in found.warnings)
-    assert np.isfinite(found.values["pde_fill"].value)
+    assert any("efficiency is not printed" in words for words in found.warnings)
+    assert "pde_fill" not in found.values
 
 
 def test_one_frame_is_refused_with_the_cure():
