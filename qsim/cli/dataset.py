@@ -140,7 +140,7 @@ def _run_plan(args: argparse.Namespace) -> int:
     with bar("planning", "kind") as progress:
         found = cost_forecast.forecast(wanted, frames=args.frames, progress=progress)
     facts = {"recipe": wanted.name, "digest": wanted.digest, "machines": args.machines}
-    facts["hours_each"] = found.hours / args.machines
+    facts["hours_each"] = found.hours_each(args.machines)
     output(args, facts | found.to_dict(), found.lines(args.machines) if wanted.jobs else _empty(whole, ()))
     return 0
 

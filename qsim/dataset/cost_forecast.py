@@ -124,6 +124,15 @@ class Forecast:
         totals = {"hours": self.hours, "processor_hours": self.processor_hours, "gigabytes": self.gigabytes}
         return totals | {"peak_memory_gib": self.peak_memory, "engine": self.engine, "kinds": rows}
 
+    def busy(self, machines: int) -> int:
+        """Return how many of these machines have work: a clip is made by one machine."""
+        return max(1, min(machines, sum(cost.clips for cost in self.costs)))
+
+    def hours_each(self, machines: int) -> float:
+        """Return the hours of each of these machines, at least those of the longest clip."""
+        longest = max((cost.hours / cost.clips for cost in self.costs), default=0.0)
+        return max(self.hours / self.busy(machines), longest)
+
     def lines(self, machines: int) -> list[str]:
         """Return the forecast as lines of text, for this many equal machines."""
         header = ("family", "size", "clips", "frames", "samples", "neighbours", "s/clip", "s/frame", "hours", "GB")
@@ -142,9 +151,9 @@ class Forecast:
             )
             for cost in self.costs
         ]
-        clips = sum(cost.clips for cost in self.costs)  # a clip is made by one machine
-        busy = min(machines, clips)
-        each = max(self.hours / busy, *(cost.hours / cost.clips for cost in self.costs))
+        clips = sum(cost.clips for cost in self.costs)
+        busy = self.busy(machines)
+        each = self.hours_each(machines)
         idle = f"; {busy} of {machines} have work, because a clip is not split" if busy < machines else ""
         day = min(max(1, math.ceil(self.hours / 24)), clips)
         faster = f", or one that is {self.hours / 24:.2g} times as fast" if day > 1 else ""

@@ -24,7 +24,7 @@ photons" means that light is to be given as photons that this sensor detects. A 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -353,9 +353,8 @@ def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:
 
 
 def _has_one_depth(model: object) -> bool:
-    """Return whether a model's codes have one depth, which its files need not state: a default of the class."""
-    own = fields(MODELS[model]) if isinstance(model, str) and model in MODELS else ()  # type: ignore[arg-type]
-    return any(field.name == "bits" and field.default is not MISSING for field in own)
+    """Return whether a model's codes have one depth, which its files need not state: spikes are there or not."""
+    return isinstance(model, str) and model in MODELS and MODELS[model].code_model == "spikes"
 
 
 def is_known(sensor: Sensor) -> bool:
