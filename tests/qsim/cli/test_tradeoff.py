@@ -118,7 +118,7 @@ def test_bits_that_were_given_are_kept_and_others_widened(clip, capsys):
         ("--table --force", "tradeoff --table: --force changes nothing here"),
         ("--table --threads 1", "tradeoff --table: --threads changes nothing here"),
         ("--table --paper-figure 1", "tradeoff --table: --paper-figure changes nothing here"),
-        ("CLIP --ppp 1 --read-noise 0", "tradeoff of a clip or scene: --read-noise changes nothing here"),
+        ("CLIP --ppp 1 --read-noise 0", "--read-noise 0: is of --table; a clip or scene is seen by a sensor"),
         ("CLIP --ppp 1 --motion 10", "tradeoff of a clip or scene: --motion changes nothing here"),
         ("CLIP --ppp 1 --size 8x8", "tradeoff of a clip: --size changes nothing here"),
         ("CLIP --ppp 1 --base-fps 20000", "tradeoff of a clip: --base-fps changes nothing here"),
