@@ -234,7 +234,7 @@ def _check_clipping(mi: Any, loaded: Any, camera: Camera, planes: tuple[float, f
     slopes = camera.directions().reshape(-1, 3)  # of z = 1, so that a distance along them is a depth
     origin = mi.Point3f(*map(float, pose[:3, 3]))
     hidden = 0
-    for slope in [slopes] if mi.variant().startswith(("llvm", "cuda")) else slopes[:, None]:
+    for slope in slopes[:, None] if mi.variant().startswith("scalar") else [slopes]:
         directions = (slope @ pose[:3, :3].T).T
         ray = mi.Ray3f(origin, mi.Vector3f(*(directions if len(slope) > 1 else map(float, directions[:, 0]))))
         depth = np.array(loaded.ray_intersect_preliminary(ray).t, np.float64)

@@ -157,7 +157,7 @@ class Distribution(ABC):
             return logs, np.where(change == 0, 0.0, change * np.exp(-logs))
 
     def dense_moments_of(self, arrivals: Array, exposure: float) -> tuple[Array, Array]:
-        """Return the same from the probabilities of all codes."""
+        """Return mean and variance [...] of the code at arrivals [...], from the probabilities of all codes."""
         codes = np.arange(self.levels, dtype=float)
         mean, variance = np.empty(len(arrivals)), np.empty(len(arrivals))
         step = max(1, _TOGETHER // self.levels)
