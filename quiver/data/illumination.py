@@ -65,6 +65,11 @@ def read_sensor(source: str | Mapping[str, Any], bits: int | None = None) -> tup
 
 
 @lru_cache(maxsize=256)
+def is_known(sensor: Sensor) -> bool:
+    """Return whether a sensor is of a model of qsim, not of a class of one's own."""
+    return devices.is_known(sensor)
+
+
 def _device(light: Illumination, exposure: float) -> Sensor:
     return devices.load(light.sensor, ppp=light.ppp, bits=light.bits, exposure=exposure)
 

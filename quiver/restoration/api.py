@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.sensor import devices
 from quiver.data.clips import Clip
 from quiver.data.codes import Codes, LazyArray, Sensor, Stream, array_codes, filled, open_stream, sensed, stream_codes
 from quiver.data.defects import check_map
-from quiver.data.illumination import Illumination
+from quiver.data.illumination import Illumination, is_known
 from quiver.restoration.automatic import MISSING, chosen
 from quiver.restoration.domain_remarks import refuse_outside, remarks
 from quiver.restoration.interface import AUTO, DEFAULT_METHOD, RestoreOptions
@@ -70,7 +69,7 @@ def restore(
     try:
         check_finite(restored, runner.name)
     except ValueError as error:
-        if devices.is_known(codes.sensor):
+        if is_known(codes.sensor):
             raise
         own = type(codes.sensor).__name__
         what = str(error).partition(";")[0]

@@ -132,7 +132,8 @@ def test_two_workers_on_a_disk_that_is_really_full(full: Path, undisturbed: dict
     assert len(undisturbed) + len(SMALL.jobs) == 38, "every job has a log too"
     resize(full, pages * mmap.PAGESIZE)
     for _ in range(2):
-        assert "while making" in stops_at_a_full_disk(full / "d", make)
+        told = stops_at_a_full_disk(full / "d", make)
+        assert ("while making" in told) == (pages > 1)  # the lock of the folder takes the only page
     # Of 36 pages the manifest takes 1 and each of the first two jobs at most 15 (13 files, journal, temporary file).
     assert pages < 36 or Dataset.open(full / "d").names()
     resize(full, 16 << 20)
