@@ -11,7 +11,8 @@ planes at half a detection each. Two corrections are made here, both from the se
 Light up to `END` is fitted. Beyond, where more than 0.3 of all windows hold top codes only, estimates are too
 low: that of such a window is finite, about the light of half a count below saturation. Below the sum of a dark window
 estimates are negative, so that means over dim pixels are right; pictures clip them. Spikes are not independent (a pixel
-keeps its charge), and their sums are left as they are. Sources: textbook.
+keeps its charge), and their sums are left as they are; so are those of a sensor whose first code needs several
+electrons. Sources: textbook.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ BIAS = 3e4  # weight of the squared relative bias, over LIGHTS levels
 LIGHTS = 160  # levels of light of a fit, over three decades
 GRID = 1024  # levels of light from DARKEST on
 COARSE = 8  # of these levels one is taken for the second order
+FIRST = 0.05  # of the range of the mean, where its power of the light is taken
+STEEPEST = 1.5  # that power, up to which estimates are made unbiased
 DARKEST = 1e-5  # of the brightest light: the first level above darkness
 FEW = 1e-3  # Poisson events of a full exposure: the first level has no more, however bright the last one is
 
@@ -59,7 +62,7 @@ def of_sums(sensor: Sensor, exposure: float, times: Times) -> Array:
     sums = np.arange(top * sum(count for _, count in times) + 1)
     light, mean, variance = _response(sensor, exposure, times)
     start = _plug_in(sums, light, mean)
-    if isinstance(sensor, SpikeCamera):
+    if isinstance(sensor, SpikeCamera) or not _proportional(light, mean):
         found = start
     elif len(sums) <= MOST:
         light = _fitted_light(sensor, exposure, times)
@@ -171,6 +174,17 @@ def _response(sensor: Sensor, exposure: float, times: Times) -> tuple[Array, Arr
         variance += count * np.concatenate([sensor.variance(part, exposure * share) for part in parts])
     rising = np.concatenate([[True], mean[1:] > np.maximum.accumulate(mean)[:-1]])
     return light[rising], mean[rising], variance[rising]
+
+
+def _proportional(light: Array, mean: Array) -> bool:
+    """Return whether the response rises in proportion to light from the dark, so that dim light can be told at all.
+
+    Where the first code needs many electrons it rises with a high power of the light, and dark codes say nothing.
+    """
+    rise = mean - mean[0]
+    first = max(int(np.searchsorted(rise, FIRST * rise[-1])), 1)
+    power = np.log(rise[first + 1] / rise[first]) / np.log(light[first + 1] / light[first])
+    return bool(power <= STEEPEST)
 
 
 def _plug_in(sums: Array, light: Array, mean: Array) -> Array:

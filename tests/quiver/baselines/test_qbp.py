@@ -304,7 +304,8 @@ def test_every_method_takes_any_size_and_length(name, shape):
     assert restored.shape == shape
     assert restored.dtype == np.float32
     assert np.isfinite(restored).all()
-    assert restored.min() >= 0
+    if name not in ("naive", "moment", "likelihood"):  # they are unbiased, and negative below the dark mean
+        assert restored.min() >= 0
 
 
 @pytest.mark.parametrize("name", METHODS)
