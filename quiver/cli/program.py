@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import Any
 from qsim.cli.completion import add_completion, sensors
 from qsim.cli.console import Parser, output, run
 from qsim.files import VERSION
-from qsim.scratch import Scratch
 from quiver.cli.domain import add_domain
 from quiver.cli.evaluate import add_bench, add_evaluate
 from quiver.cli.options import command, handling
@@ -95,11 +93,7 @@ def _run_convert_weights(args: argparse.Namespace) -> int:
         raise ValueError(f"{args.output}: weights are written as .safetensors; name a .safetensors file with -o")
     if args.force and args.output.exists():
         _check_ours(args.output)
-        with Scratch(args.output) as scratch:
-            network = convert_weights(args.source, scratch.new())
-            os.replace(scratch.new(), args.output)
-    else:
-        network = convert_weights(args.source, args.output)
+    network = convert_weights(args.source, args.output, force=args.force)
     parameters = sum(p.numel() for p in network.parameters())
     found = {"weights": str(args.output), "channels": network.config.channels, "parameters": parameters}
     size = f"{network.config.channels} channels, {parameters:,} parameters"

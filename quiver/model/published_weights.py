@@ -148,12 +148,12 @@ def _check_constant(name: str, value: Tensor) -> None:
         raise ValueError(f"published checkpoint: {published_name(name)} must be {constant}, got {float(value)}")
 
 
-def convert_weights(source: Path, target: Path) -> QUIVER:
+def convert_weights(source: Path, target: Path, *, force: bool = False) -> QUIVER:
     """Convert a published checkpoint (.pt, .pth, .ckpt, .safetensors) to our file, and return the network.
 
-    ValueError for any other content, FileExistsError if `target` exists.
+    ValueError for any other content, FileExistsError if `target` exists; `force` replaces it, in one step.
     """
-    if target.exists():
+    if target.exists() and not force:
         raise FileExistsError(f"{target} exists; choose another name or remove it")
     network = from_published(_read_foreign(source))
     save(network, network.config, target, notes={"converted_from": source.name})
