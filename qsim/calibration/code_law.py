@@ -131,7 +131,8 @@ def _edgeworth(at: Array, noise: float, mean: Array, spread: Array) -> tuple[Arr
         from scipy.special import ndtr
 
         deviation = np.sqrt(variance)
-        skew, kurtosis = mean / deviation**3, mean / deviation**4
+        skew = mean / deviation**3
+        kurtosis = mean / deviation**4
         y = (at - (mean + shift)[:, None]) / deviation[:, None]
         series = skew[:, None] / 6 * (y**2 - 1) + kurtosis[:, None] / 24 * (y**3 - 3 * y)
         series += skew[:, None] ** 2 / 72 * (y**5 - 10 * y**3 + 15 * y)

@@ -132,7 +132,9 @@ def _crosstalk(stack: FrameStatistics, bits: int, value: float) -> _Pairs | None
     if stack.adjacent is None or t < 3 or not variance.any() or max(stack.total.shape) < 2:
         return None
     mean = stack.total / t
-    covariance, expected, noise = 0.0, 0.0, 0.0
+    covariance = 0.0
+    expected = 0.0
+    noise = 0.0
     if bits == 1:
         fired = Response(1, 0.0, False, stack.exposure, crosstalk=value).before_crosstalk(mean)
         room = 1 - mean

@@ -64,7 +64,9 @@ def distribution(counts: Counts) -> Distribution:
     if noise < 1 / RESOLVED or noise < min(1 / _LEAST_COUNTS, _NARROW * spread):
         median, low, high = _order_statistic(ordered, 50.0, counts)
         skewed = counts.spread / 6 * noise / (noise + spread)  # of a Poisson law the median is below the mean
-        median, low, high = median + skewed, low + skewed, high + skewed
+        median = median + skewed
+        low = low + skewed
+        high = high + skewed
         method = "order statistics"
     else:
         median, low, high = _fitted_median(counts)

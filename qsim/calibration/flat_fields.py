@@ -54,7 +54,8 @@ def dark_rates(darks: Sequence[FrameStatistics], response: Response) -> DarkRate
         missing = np.where(better, room, missing)
         frames = np.where(better, stack.frames, frames)
         exposure = np.where(better, stack.exposure, exposure)
-    rate, variance = rate / weight, variance / weight**2
+    rate = rate / weight
+    variance = variance / weight**2
     total = sum(stack.frames * stack.exposure for stack in darks)
     return DarkRates(rate, variance, rate * total, total, missing <= 0, missing, frames, exposure)
 

@@ -110,7 +110,9 @@ def measure(
     stack without frames are refused too.
     """
     _check_light(exposure, photons, name)
-    frames, sums, stride = 0, None, 1
+    frames = 0
+    sums = None
+    stride = 1
     histogram = np.zeros(1 << bits, np.int64)
     sample: list[Array] = []
     for block in blocks:

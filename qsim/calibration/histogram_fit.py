@@ -140,7 +140,8 @@ class Likelihood:
         members = list(panel.cells)
         spread = self.spreads(exp(parameters[GAIN]), excess)[members][:, None]
         by_gain = law.by_gain - 2 * spread * law.by_spread
-        share, dark = self.share[members][:, None], self.dark[members][:, None]
+        share = self.share[members][:, None]
+        dark = self.dark[members][:, None]
         return np.stack([by_gain, law.by_offset, law.by_noise, share * law.by_mean, np.where(dark, 0.0, law.by_mean)])
 
     def at(self, parameters: Array) -> State:

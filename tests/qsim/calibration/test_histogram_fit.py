@@ -35,7 +35,10 @@ def test_law_is_that_of_the_sensor():
 
 
 def test_slopes_of_the_law_are_its_differences():
-    """Derivatives by all five arguments, of narrow, wide and negative spreads, in both forms of the law."""
+    """Derivatives of narrow, wide and negative spreads: by all five arguments of the series, by four of the exact sum.
+
+    Those of the exact sum leave out how its points follow the mean, and only guide the fit; intervals do not use them.
+    """
     rng = np.random.default_rng(5)
     for smooth in (False, True):
         for _ in range(30):
