@@ -17,7 +17,6 @@ import os
 import re
 import shutil
 import stat
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -27,6 +26,7 @@ import numpy as np
 
 from qsim.parsing import parse_json, parse_toml
 from qsim.scratch import Scratch, is_scratch, sweep
+from qsim.thread_warnings import warnings_here
 
 Progress = Callable[[int, int], None]  # is called with (done, total)
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")  # of clips and streams: a safe file name
@@ -274,8 +274,7 @@ def check_name(name: Any) -> str:
 def decoding_errors(path: Path, what: str) -> Iterator[None]:
     """Turn errors and warnings of a decoder into one `ValueError`; a missing file stays `FileNotFoundError`."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings_here("error"):
             yield
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None

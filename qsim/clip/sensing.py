@@ -383,7 +383,8 @@ def _write(clip: ClipFolder, name: str, blocks: Iterable[Array], sensor: Sensor,
 
 
 def _tidy(clip: ClipFolder) -> None:
-    """Delete the lock of a writer that was killed after its stream was written."""
+    """Delete what a writer left that was killed after its stream was written."""
+    scratch.sweep(clip.path / "streams")
     lock = locks.Lock(clip.path / "streams" / "lock")
     with contextlib.suppress(OSError):  # a read-only folder
         if lock.path.exists() and lock.acquire():

@@ -32,6 +32,7 @@ from qsim.dataset.repair import repair_jobs
 from qsim.dataset.worker_pool import Limits, run_here, run_local
 from qsim.files import VERSION, Progress
 from qsim.locks import Lock
+from qsim.scratch import sweep
 
 Executor = Callable[[list[Job], Path, RenderJob], Generator[Result]]
 
@@ -181,6 +182,7 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
     """Make folders and manifest; return the repairs of the manifest. `ValueError` if it is another recipe's."""
     for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
+        sweep(folder / name)
     if not (folder / "dataset.json").is_file():
         _check_records(recipe, folder, repair)
         _check_reads(recipe, folder)
@@ -263,6 +265,8 @@ def _locked(folder: Path, options: Options) -> Iterator[None]:
     if folder.exists() and not _is_data_set(folder):
         raise ValueError(f"{folder}: is not empty and not a data set; use another folder")
     (folder / "locks").mkdir(parents=True, exist_ok=True)
+    sweep(folder)
+    sweep(folder / "locks")
     held = [Lock(folder / "locks" / "generate", shared=options.shard is not None)]
     if options.shard is not None:
         held.append(Lock(folder / "locks" / "shard-{}-of-{}".format(*options.shard)))

@@ -6,7 +6,6 @@ No pickled code is executed: our files are safetensors, and torch reads other ch
 import hashlib
 import json
 import pickle
-import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from qsim.files import write_bytes
+from qsim.thread_warnings import warnings_here
 from quiver.model.presets import NETWORKS
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files
@@ -42,8 +42,7 @@ def read_torch(path: Path, device: torch.device | str = "cpu") -> Any:
                 told = sum(part.file_size for part in archive.infolist())
             if told > path.stat().st_size:
                 raise ValueError(f"parts of {told} bytes in a file of {path.stat().st_size}")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # about pickle dialects, which end in the error below
+        with warnings_here("ignore"):  # about pickle dialects, which end in the error below
             return torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError:  # torch advises to trust the file, with escapes of the terminal
         raise ValueError("it holds pickled objects beside tensors and plain values") from None

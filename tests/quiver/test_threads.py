@@ -19,6 +19,7 @@ from qsim.clip import sensing
 from quiver import threads
 from quiver.cli import program
 from quiver.model.unet import UNet, UNetConfig
+from quiver.restoration.restored_file import FORMAT
 from quiver.training.loop import train
 from quiver.training.settings import Settings
 
@@ -157,7 +158,7 @@ def test_restored_video_notes_its_number(make_clip: ClipMaker, tmp_path, capsys)
 
     assert noted("--threads", 2) == 2
     assert noted("--threads", 1) == 1
-    (tmp_path / "v.npy.part.json").write_text('{"threads": 2}')
+    (tmp_path / "v.npy.part.json").write_text(json.dumps({"format": FORMAT, "threads": 2}))
     assert noted() == 2
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import warnings
 from functools import cache
 from math import log
 from typing import Any
@@ -16,6 +15,7 @@ from qsim import backend as engine
 from qsim import llvm
 from qsim.device_lock import one_thread_at_a_time
 from qsim.keys import KEY_STEPS, MULTIPLIERS, ROUNDS
+from qsim.thread_warnings import warnings_here
 
 _PACKET = 16  # numbers that a kernel works on at a time, at most
 _INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
@@ -33,8 +33,7 @@ def available() -> bool:
 @one_thread_at_a_time
 def backend() -> Any:
     """Return `drjit.cuda` or `drjit.llvm`; None where neither works on this machine."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Sensor.sample warns that the reference draws
+    with warnings_here("ignore"):  # Sensor.sample warns that the reference draws
         chosen = engine.choose()
     if chosen.backend == "scalar":
         return None

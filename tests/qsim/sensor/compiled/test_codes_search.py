@@ -179,8 +179,8 @@ def corner_sensor(rng: np.random.Generator, bits: int) -> Sensor:
         return CountingSPAD(float(rng.uniform(0.02, 1)), float(10 ** rng.uniform(-1, 6)), dead, bits, True)
     return QIS(
         float(rng.choice([1.0, 0.5, 0.3])),
-        float(rng.choice([0.0, 1e-300, 2000.0])),
-        float(rng.choice([0.0, 1e-9, 1e-3, 0.5])),
+        float(rng.choice([0.0, 1e-30, 2000.0])),
+        float(rng.choice([0.0, 1e-6, 1e-3, 0.5])),
         bits,
         gain=float(rng.choice([1.0, 0.5, 2.0, 1 / 3, 2.0**-6])),
         offset=float(rng.choice([0.0, 0.5, -0.5, 1e-9, 0.49999999])),
