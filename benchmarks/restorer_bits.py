@@ -1,6 +1,6 @@
 """Finds the best bit depth for motion and light with the default restorer (`--method auto`).
 
-    python benchmarks/restorer_bits.py                             # minutes; docs/results/restorer_bits.md, .png, .json
+    python benchmarks/restorer_bits.py   # minutes; docs/results/restorer_bits.md, .png, .json; `qsim tradeoff`
     python benchmarks/restorer_bits.py --scenes 1 --size 64 --out out/bits
 
     photographs that slide and hide one another -> light of 10,000 planes per second -> codes of 2^b - 1 planes each
@@ -27,6 +27,7 @@ from qsim.files import VERSION, write_bytes, write_json
 from qsim.formats.warped_pictures import FINE, Layer, Path2D, frame
 from qsim.keys import Key
 from qsim.scene.textures import photograph
+from qsim.studies.bit_depth.restored_bits import TABLE
 from qsim.tables import markdown_table
 from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
@@ -36,6 +37,7 @@ from quiver.restoration.automatic import chosen
 from quiver.restoration.restorers import weights_path
 
 ROOT = Path(__file__).parents[1]
+DEFAULT = ROOT / "docs" / "results" / "restorer_bits"
 PLANE = 1e-4  # s
 UNIT = 7  # planes of a 3-bit code, in which motion is counted
 BITS = (1, 2, 3, 4, 5)
@@ -121,6 +123,12 @@ def table_of(rows: dict[str, list[dict[str, Any]]]) -> Array:
     )
 
 
+def of_package(found: Array, weights: str) -> dict[str, Any]:
+    """Return the table that `qsim tradeoff` quotes: dB [motion][light][bits], to 0.01 dB."""
+    places = {"px": list(MOTION), "ppp": list(LIGHTS), "bits": list(BITS)}
+    return places | {"weights": weights, "psnr_db": found.round(2).tolist()}
+
+
 def page(found: Array, scenes: int, size: int, weights: str) -> str:
     """Return the page of all numbers."""
     best = np.take(BITS, found.argmax(-1))
@@ -167,7 +175,7 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=6, help="scenes (default 6)")
     parser.add_argument("--size", type=int, default=96, help="px, side of a frame (default 96)")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "restorer_bits", help="without suffix")
+    parser.add_argument("--out", type=Path, default=DEFAULT, help="without suffix")
     args = parser.parse_args(words)
     if args.scenes < 1 or not 4 * EDGE <= args.size <= 256:
         print(f"restorer_bits: give --scenes of at least 1 and --size of {4 * EDGE} to 256", file=sys.stderr)
@@ -180,6 +188,8 @@ def main(words: list[str] | None = None) -> int:
     found = table_of(rows)
     write_bytes(args.out.with_suffix(".md"), page(found, args.scenes, args.size, weights).encode())
     draw(found, args.out.with_suffix(".png"))
+    if args.out == DEFAULT:
+        write_json(TABLE, of_package(found, weights))
     print(f"{args.out.with_suffix('.md')}: written")
     return 0
 

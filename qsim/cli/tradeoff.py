@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks, files
-from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, command, note, output, refuse_existing, refuse_idle
+from qsim.cli.console import MAKES_AGAIN, PILOT, RESUMES, bar, command, note, output, refuse_existing, refuse_idle
 from qsim.cli.options import check_free, checked, count, frame_size, positive, steps, whole_numbers
+from qsim.files import Progress
+from qsim.time_forecast import TimeForecast
 
 
 def add_tradeoff(sub: Any) -> None:
@@ -39,7 +41,10 @@ def add_tradeoff(sub: Any) -> None:
     moving.add_argument(
         "--speed", type=steps, help="factors on the motion, listed as in --ppp (default 1; of a clip: whole factors)"
     )
-    px = "motion of the moving pixels, px per 3-bit frame of 7 planes, listed as in --ppp; sets the speed"
+    px = (
+        "motion of the moving pixels, px per 3-bit frame of 7 planes, listed as in --ppp; sets the speed, and the "
+        "moving pixels alone are scored"
+    )
     moving.add_argument("--px", type=steps, help=px)
     files_of = "a name of `qsim doctor --devices`, or a file of a SPAD or of a QIS with gain 1, whatever its bits"
     parser.add_argument(
@@ -108,7 +113,7 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
 
     bits, instants = tuple(args.bits or (1, 2, 3, 4, 5)), 8 if args.instants is None else args.instants
     sensor = args.sensor or "quiver-physical"
-    settings = StudySettings(bits, sensor, args.plane_sensor, None, 1, instants, args.seed)
+    settings = StudySettings(bits, sensor, args.plane_sensor, None, 1, instants, args.seed, moving=bool(args.px))
     study_clips.check_sensors(settings, args.streams)  # before anything is rendered
     height, width = args.size or (96, 128)
     widen = args.bits is None
@@ -120,12 +125,15 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
         if frames < settings.longest:
             raise ValueError(f"--frames {frames}: {max(bits)} bits need {settings.longest}; give more, or fewer bits")
     shape = study_clips.ClipShape(frames, height, width, rate, seed=args.seed)
-    speeds, text = _speeds(args, shape)
+    speeds = _speeds(args, shape)
     levels = args.ppp or [None]
     swept = len(speeds) * len(levels) > 1
     if args.streams and swept:
         raise ValueError("--streams: writes one speed and one light level; give one --ppp and one --speed or --px")
-    with bar("rendering") as progress:
+    missing = study_clips.to_render(args.source, speeds, args.output)
+    rendering = TimeForecast(f"rendering {_clips(missing)} of {shape.frames} frames", note, parts=missing)
+    with bar("rendering", first=PILOT if missing else "") as shown:
+        progress = _both(shown, rendering)
         clips = list(study_clips.clips_for(args.source, speeds, shape, args.output, progress))
     first = clips[0].clip
     if args.streams and clips[0].step > 1:
@@ -135,9 +143,12 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     if args.streams:  # refused before the study, not after it
         for depth in range(1, WIDEST + 1) if widen else settings.bits:
             study_clips.stream_clip(first, args.output / "streams", depth, args.force)
-    with bar("drawing", "study") as progress:
+    text: list[str] = []
+    with bar("drawing", "study" if swept else "frame") as shown:
         if swept:
             ppps = args.ppp or [first.mean_photons]
+            drawing = TimeForecast(f"drawing {len(speeds) * len(ppps)} studies", note)
+            progress = _both(shown, drawing)
             found = speed_sweep.sweep(clips, ppps, settings, widen=widen, progress=progress)
             result, pictures = found.to_dict(), {"best.png": figures.sweep_figure(found)}
             text += [line for row in found.studies for one in row for line in speed_sweep.table(one)]
@@ -145,12 +156,14 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
             answers = found.answers
         else:
             asked = replace(settings, ppp=levels[0], speed=clips[0].step)
+            progress = _both(shown, TimeForecast("drawing the study", note))
             one = widened(first, asked, note) if widen else study(first, asked, progress=progress)
             result, pictures = speed_sweep.study_dict(one), {"tradeoff.png": figures.study_figure(one)}
             text += speed_sweep.table(one)
             settings, answers = replace(settings, bits=one.bits), [answer(one)]
     if args.px:
         result["px_asked"], result["speeds_found"] = args.px, speeds
+        text = [f"--px {px:g}: speed factor {speed:g}" for px, speed in zip(args.px, speeds, strict=True)] + text
     if args.streams:
         args.after_interrupt = MAKES_AGAIN
         lit = replace(settings, ppp=levels[0])
@@ -163,8 +176,22 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     return 0
 
 
-def _speeds(args: argparse.Namespace, shape: Any) -> tuple[list[float], list[str]]:
-    """Return the factors on the motion, and a line for each given motion."""
+def _clips(count: int) -> str:
+    return f"{count} clip{'' if count == 1 else 's'}"
+
+
+def _both(one: Progress, other: Progress) -> Progress:
+    """Return a progress that tells both."""
+
+    def told(done: int, total: int) -> None:
+        one(done, total)
+        other(done, total)
+
+    return told
+
+
+def _speeds(args: argparse.Namespace, shape: Any) -> list[float]:
+    """Return the factors on the motion, found from --px or given."""
     from functools import partial
 
     from qsim import scenes
@@ -172,7 +199,7 @@ def _speeds(args: argparse.Namespace, shape: Any) -> tuple[list[float], list[str
     from qsim.studies.bit_depth import answer as tradeoff_answer
 
     if not args.px:
-        return args.speed or [1.0], []
+        return args.speed or [1.0]
     found: list[tuple[float, float]] = []
     if (Path(args.source) / "clip.json").is_file():
         clip = Clip.open(args.source)
@@ -182,11 +209,7 @@ def _speeds(args: argparse.Namespace, shape: Any) -> tuple[list[float], list[str
         found = [tradeoff_answer.speed_for(px, motion, args.source) for px in args.px]
     if len({speed for speed, _ in found}) < len(found):
         raise ValueError(f"{args.source}: several of --px {args.px} need one and the same speed; give fewer")
-    text = [
-        f"--px {px:g}: speed factor {speed:g} gives {reached:.3g} px per 3-bit frame (7 planes), mean of what moves"
-        for px, (speed, reached) in zip(args.px, found, strict=False)
-    ]
-    return [speed for speed, _ in found] or [1.0], text
+    return [speed for speed, _ in found] or [1.0]  # 1: `clips_for` refuses what is neither a clip nor a scene
 
 
 def _motion(name: str, shape: Any, speed: float) -> float:

@@ -12,7 +12,7 @@ SIZE = (48, 64)
 def wave_clip(path, frames: int, speed: int, frame_rate: float = 10_000.0, *, still: int = 0) -> Clip:
     """Write a clip of a periodic texture that moves to the right by `speed` px per frame.
 
-    The flow of the first `still` rows is 0.
+    The first `still` rows rest.
     """
     y, x = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
     turn = 2 * np.pi / SIZE[1]
@@ -23,5 +23,7 @@ def wave_clip(path, frames: int, speed: int, frame_rate: float = 10_000.0, *, st
     truth = {"flow": flow, "flow_back": -flow, "valid": np.ones(SIZE, bool)}
     with ClipWriter(path, meta) as writer:
         for t in range(frames):
-            writer.add(t, np.roll(texture, speed * t, axis=1).astype(np.float32), truth=truth)
+            moved = np.roll(texture, speed * t, axis=1)
+            moved[:still] = texture[:still]
+            writer.add(t, moved.astype(np.float32), truth=truth)
     return Clip.open(path)

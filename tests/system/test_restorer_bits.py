@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -14,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import restorer_bits
 
 from qsim.formats.warped_pictures import frame
+from qsim.studies.bit_depth import restored_bits
 
 
 @pytest.mark.parametrize("bits", [1, 2, 4])
@@ -71,3 +73,11 @@ def test_the_program_measures_and_writes(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert restorer_bits.main(["--size", "16", "--out", str(tmp_path / "bits")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_tradeoff_quotes_what_the_page_shows():
+    """The table in the package is that of the numbers behind the page."""
+    stored = json.loads(restorer_bits.DEFAULT.with_suffix(".json").read_bytes())
+    made = restorer_bits.of_package(restorer_bits.table_of(stored["motion"]), stored["weights"])
+    assert json.loads(restorer_bits.TABLE.read_bytes()) == made
+    assert str(restorer_bits.DEFAULT.with_suffix(".md").relative_to(restorer_bits.ROOT)) == restored_bits.PAGE

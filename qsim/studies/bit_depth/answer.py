@@ -1,7 +1,8 @@
 """Finds the speed for a wanted motion, widens a study while its deepest frame is best, states the best depth.
 
 A **plane** is one clip frame read with one bit. A **frame** of b bits is 2^b - 1 planes, and a **code** is the value of
-a pixel in one frame. Motion is the mean over the pixels that move more than 0.1 px per frame of `CODE_BITS` bits.
+a pixel in one frame. Motion is the mean over the pixels that move more than 0.1 px per frame of `CODE_BITS` bits, and
+over a few frames of the clip (`qsim.clip.motion_statistics`).
 """
 
 from __future__ import annotations
@@ -12,19 +13,19 @@ from dataclasses import replace
 import numpy as np
 
 from qsim.clip.clip import Clip
-from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, moving_mean
-from qsim.studies.bit_depth.clip_study import Study, StudyRow, clip_motion, study
+from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, looks, moving_mean
+from qsim.studies.bit_depth import restored_bits
+from qsim.studies.bit_depth.clip_study import Study, StudyRow, mean_motion, study
 from qsim.studies.bit_depth.readout import MODELS, StudySettings
 
 WIDEST = 7  # bits: the largest depth to which a study is widened
-LOOKS = 4  # instants at which the motion of a scene is measured
 SPEEDS = (1e-3, 1e3)  # factors on a scene's motion that are tried
 CLOSE = 0.01  # relative difference to the wanted motion at which the search ends
 NEAR = 0.05  # largest relative difference that is accepted
 
 
 def scene_motion(name: str, size: tuple[int, int], *, frames: int, frame_rate: float, seed: int, speed: float) -> float:
-    """Return the motion of a scene [px per frame of 3 bits]: the mean over `LOOKS` instants; 0 if nothing moves.
+    """Return the motion of a scene [px per frame of 3 bits]: the mean over its `looks`; 0 if nothing moves.
 
     The flow comes from rays to the first surfaces; nothing is rendered.
     """
@@ -33,8 +34,8 @@ def scene_motion(name: str, size: tuple[int, int], *, frames: int, frame_rate: f
 
     renderer = Renderer(scenes.load(name, seed=seed, speed=speed).resized(*size), frame_rate=frame_rate)
     found = []
-    for t in np.linspace(0, frames - 1, LOOKS).round():
-        u, v = renderer.truth(int(t))["flow"]
+    for t in looks(frames):
+        u, v = renderer.truth(t)["flow"]
         found.append(moving_mean(np.hypot(u, v), CODE_PLANES) or 0.0)
     return float(np.mean(found))
 
@@ -77,13 +78,11 @@ def step_for(px: float, clip: Clip) -> tuple[int, float]:
     """
     if not clip.has_truth:
         raise ValueError(f"{clip.path}: has no ground truth, so its motion is unknown; give --speed instead of --px")
-    times = np.linspace(0, len(clip) - 1, min(LOOKS, len(clip))).round()
     motions: dict[int, float] = {}
 
     def at(step: int) -> float:
         if step not in motions:
-            found = [clip_motion(clip, int(t), step) or 0.0 for t in times]
-            motions[step] = CODE_PLANES * float(np.mean(found))
+            motions[step] = CODE_PLANES * (mean_motion(clip, step) or 0.0)
         return motions[step]
 
     if at(max(1, len(clip))) == 0:
@@ -134,10 +133,14 @@ def code_motion(row: StudyRow) -> float | None:
 
 
 def answer(found: Study) -> str:
-    """Return one sentence: the best depth of both readouts, and how many dB its neighbours are worse."""
+    """Return one sentence: the best depth of both readouts, how many dB its neighbours are worse, and once restored."""
     motion = code_motion(found.rows[0])
     where = "at unknown motion" if motion is None else f"at {motion:.3g} px per {CODE_BITS}-bit frame"
-    return f"{where} and {found.ppp:.3g} photons per plane: " + "; ".join(_of_model(found, model) for model in MODELS)
+    seen = "one frame, pixels that move" if found.moving else "one frame, still pixels included"
+    depths = [_of_model(found, model) for model in MODELS]
+    if motion is not None:
+        depths.append(restored_bits.sentence(motion, found.ppp))
+    return f"{where} and {found.ppp:.3g} photons per plane, {seen}: " + "; ".join(depths)
 
 
 def _of_model(found: Study, model: str) -> str:
@@ -145,10 +148,7 @@ def _of_model(found: Study, model: str) -> str:
     rows = sorted((row for row in found.rows if row.model == model), key=lambda row: row.bits)
     place = rows.index(best)
     beside = [row for row in (rows[place - 1] if place else None, *rows[place + 1 : place + 2]) if row is not None]
-    losses = [f"{best.psnr_db - row.psnr_db:.1f}" for row in beside]
-    bits = " and ".join(str(row.bits) for row in beside)
-    many = "bit is" if bits == "1" else "bits are"
-    worse = f", {bits} {many} {' and '.join(losses)} dB worse" if beside else ""
+    worse = restored_bits.worse({row.bits: best.psnr_db - row.psnr_db for row in beside})
     text = f"{model} {marked(found, model)} bit{'s' if best.bits > 1 else ''}{worse}"
     if edge == ">=":
         text += " (the deepest tried"

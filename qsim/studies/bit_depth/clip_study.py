@@ -25,7 +25,7 @@ from numpy import ndarray as Array
 
 from qsim import keys
 from qsim.clip.clip import Clip
-from qsim.clip.motion_statistics import CODE_PLANES, SLOWEST, moving_mean
+from qsim.clip.motion_statistics import CODE_PLANES, SLOWEST, looks, moving_mean, moving_pixels
 from qsim.clip.photons import clip_photons, light_level
 from qsim.colour import psnr
 from qsim.optics import radiometry
@@ -37,7 +37,7 @@ from qsim.studies.bit_depth.readout import GRID, Readout, StudySettings, readout
 
 @dataclass(frozen=True)
 class StudyRow:
-    """One bit depth of one model; errors are rms over pixels, in photons per pixel and clip frame (plane)."""
+    """One bit depth of one model; errors are rms over scored pixels, in photons per pixel and clip frame (plane)."""
 
     model: str  # "planes" or "multibit"
     bits: int
@@ -69,6 +69,8 @@ class Study:
     speed: int
     instants: tuple[int, ...]  # clip frames that were scored
     structure: Structure  # of the light, in photons^2 per clip frame
+    moving: bool = False  # errors are those of the pixels that move
+    share: float = 1.0  # of the pixels that were scored
 
     @property
     def bits(self) -> tuple[int, ...]:
@@ -82,13 +84,18 @@ class Study:
 
 @dataclass(frozen=True)
 class Exposed:
-    """One frame of M clip frames around an instant; arrays are float64 [H, W]."""
+    """One frame of M clip frames around an instant; arrays are float64, [H, W] or the scored pixels [N]."""
 
     planes: int
     photons: Array  # sum of the light, photons
     fired: Array  # number of planes that fired (model "planes")
     quiet: Array  # sum of the probabilities 1 - p that a plane does not fire
     spread: Array  # sum of p (1 - p), the variance of `fired`
+
+    def only(self, pixels: Array) -> Exposed:
+        """Return the frame of some pixels, given as bool [H, W]."""
+        arrays = (self.photons, self.fired, self.quiet, self.spread)
+        return Exposed(self.planes, *(values[pixels] for values in arrays))
 
 
 def check_clip(clip: Clip, settings: StudySettings) -> None:
@@ -115,12 +122,13 @@ def instants(frames: int, settings: StudySettings) -> tuple[int, ...]:
 
 
 def expose(
-    clip: Clip, centre: int, settings: StudySettings, factor: float, plane: Sensor, structure: Array
+    clip: Clip, centre: int, settings: StudySettings, factor: float, plane: Sensor, structure: Array, scored: Array
 ) -> Iterator[Exposed]:
     """Yield the frames of all depths around one clip frame, shallow to deep; add squared differences to `structure`.
 
-    `factor` multiplies the light of the clip. `structure` is float64 [K]: entry k grows by the mean over pixels of
-    (difference of light)^2 at two instants that are k planes apart, symmetric about the centre.
+    `factor` multiplies the light of the clip. `structure` is float64 [K]: entry k grows by the sum over the pixels
+    `scored` (bool [H, W]) of (difference of light)^2 at two instants that are k planes apart, symmetric about the
+    centre.
     """
     key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
     wanted = [2**b - 1 for b in settings.bits]
@@ -135,8 +143,8 @@ def expose(
             fired += plane.sample(light, clip.exposure, key=key.at(t), origin=clip.origin)
             total, quiet, spread = total + light, quiet + p[..., 0], spread + p[..., 0] * p[..., 1]
         if reach:
-            structure[2 * reach - 1] += np.mean((pair[0] - before) ** 2)
-            structure[2 * reach] += np.mean((pair[0] - pair[1]) ** 2)
+            structure[2 * reach - 1] += np.sum((pair[0] - before)[scored] ** 2)
+            structure[2 * reach] += np.sum((pair[0] - pair[1])[scored] ** 2)
             before = pair[1]
         if 2 * reach + 1 in wanted:
             yield Exposed(2 * reach + 1, total.copy(), fired.copy(), quiet.copy(), spread.copy())
@@ -151,7 +159,7 @@ class _Sums:
         self.quiet = 0.0  # noise without read noise
 
     def add(self, readout: Readout, frame: Exposed, codes: Array, sharp: Array) -> None:
-        """Add the errors of one frame, in photons per clip frame; `codes` and `sharp` are [H, W]."""
+        """Add the errors of one frame, in photons per clip frame; `codes` and `sharp` are [N]."""
         m = frame.planes
         light = _equivalent(readout, frame)
         mean, variance = readout.moments(light)
@@ -180,7 +188,7 @@ def _duration(readout: Readout) -> float:
 
 
 def _equivalent(readout: Readout, frame: Exposed) -> Array:
-    """Return the constant light [photons per frame] that gives the same mean code, [H, W]."""
+    """Return the constant light [photons per frame] that gives the same mean code, of the frame's shape."""
     if readout.model == "multibit":
         return frame.photons
     sensor = readout.sensor
@@ -203,25 +211,47 @@ def study(clip: Clip, settings: StudySettings, *, progress: Callable[[int, int],
     centres = instants(len(clip), settings)
     sums = {(form.model, form.planes): _Sums() for form in forms}
     by_planes = {m: [form for form in forms if form.planes == m] for m in (2**b - 1 for b in settings.bits)}
-    structure, motions = np.zeros(2 ** settings.bits[-1] - 1), []
+    structure = np.zeros(2 ** settings.bits[-1] - 1)
+    pixels = 0
     for done, centre in enumerate(centres):
+        scored = scored_pixels(clip, centre, settings)
+        pixels += int(scored.sum())
         sharp = clip_photons(clip, centre, level.factor, sharp=True)
-        motions.append(clip_motion(clip, centre, settings.speed))
-        for frame in expose(clip, centre, settings, level.factor, forms[0].sensor, structure):
+        for frame in expose(clip, centre, settings, level.factor, forms[0].sensor, structure, scored):
             for form in by_planes[frame.planes]:
                 codes = (
                     frame.fired.astype(np.intp)
                     if form.model == "planes"
                     else _read(clip, form, frame, centre, settings)
                 )
-                sums[form.model, form.planes].add(form, frame, codes, sharp)
+                if scored.any():
+                    sums[form.model, form.planes].add(form, frame.only(scored), codes[scored], sharp[scored])
         if progress is not None:
             progress(done + 1, len(centres))
-    law = Structure(structure / len(centres))
-    motion = None if None in motions else float(np.mean([m for m in motions if m is not None]))
+    if not pixels:
+        raise ValueError(
+            f"{clip.path}: no pixel moves at its frames {', '.join(map(str, centres))}, which would be scored; give "
+            "more --instants, or --speed instead of --px to score all pixels"
+        )
+    law = Structure(structure / pixels)
+    motion = mean_motion(clip, settings.speed)
     peak = radiometry.WHITE_PER_MEAN * level.ppp
     rows = tuple(_row(clip, form, sums[form.model, form.planes], law, motion, peak, level.ppp) for form in forms)
-    return Study(clip.name, rows, level.ppp, level.lux, peak, clip.frame_rate, settings.speed, centres, law)
+    share = pixels / (len(centres) * math.prod(clip.shape[1:]))
+    light = (level.ppp, level.lux, peak)
+    return Study(clip.name, rows, *light, clip.frame_rate, settings.speed, centres, law, settings.moving, share)
+
+
+def scored_pixels(clip: Clip, centre: int, settings: StudySettings) -> Array:
+    """Return the pixels whose errors count at a clip frame, bool [H, W]: all, or those that move then.
+
+    Raise `ValueError` where the motion is wanted and the clip has no ground truth.
+    """
+    if not settings.moving:
+        return np.ones(clip.shape[1:], bool)
+    if not clip.has_truth:
+        raise ValueError(f"{clip.path}: has no ground truth, so it is unknown which of its pixels move")
+    return moving_pixels(settings.speed * np.hypot(*clip.flow(centre)), CODE_PLANES)
 
 
 def _read(clip: Clip, form: Readout, frame: Exposed, centre: int, settings: StudySettings) -> Array:
@@ -239,6 +269,13 @@ def clip_motion(clip: Clip, t: int, speed: int = 1) -> float | None:
         return None
     u, v = clip.flow(t)
     return (moving_mean(speed * np.hypot(u, v), CODE_PLANES) or 0.0) / CODE_PLANES
+
+
+def mean_motion(clip: Clip, speed: int = 1) -> float | None:
+    """Return the mean of `clip_motion` over a few frames of the clip [px per plane]: the motion of the whole clip."""
+    found = [clip_motion(clip, t, speed) for t in looks(len(clip))]
+    known = [motion for motion in found if motion is not None]
+    return float(np.mean(known)) if known else None
 
 
 def _row(

@@ -76,7 +76,10 @@ def render(name: str, path: Path, shape: ClipShape, *, speed: float = 1.0, progr
 def clips_for(
     source: str, speeds: Sequence[float], shape: ClipShape, folder: Path | None, progress: Progress | None = None
 ) -> Iterator[MovingClip]:
-    """Yield a clip at each speed: a clip folder (whole speeds from 1), or a scene rendered into FOLDER/clips."""
+    """Yield a clip at each speed: a clip folder (whole speeds from 1), or a scene rendered into FOLDER/clips.
+
+    `progress` is called with the frames that are rendered and to be rendered, of all clips together.
+    """
     if (Path(source) / "clip.json").is_file():
         clip = Clip.open(source)
         if any(v < 1 or not float(v).is_integer() for v in speeds):
@@ -93,9 +96,29 @@ def clips_for(
         )
     if folder is None:
         raise ValueError(f"{source} is a scene: give a folder for its clip with -o")
-    for v in speeds:
-        path = folder / "clips" / f"{Path(source).stem}_x{v:g}"
-        yield MovingClip(v, render(source, path, shape, speed=v, progress=progress))
+    paths = {v: clip_path(folder, source, v) for v in speeds}
+    missing = [v for v, path in paths.items() if not (path / "clip.json").is_file()]
+
+    def of_all(v: float) -> Progress | None:
+        if progress is None or v not in missing:
+            return None
+        before = missing.index(v) * shape.frames
+        return lambda done, total: progress(before + done, len(missing) * shape.frames)
+
+    for v, path in paths.items():
+        yield MovingClip(v, render(source, path, shape, speed=v, progress=of_all(v)))
+
+
+def clip_path(folder: Path, source: str, speed: float) -> Path:
+    """Return the folder of the clip of a scene at a speed."""
+    return folder / "clips" / f"{Path(source).stem}_x{speed:g}"
+
+
+def to_render(source: str, speeds: Sequence[float], folder: Path | None) -> int:
+    """Return how many clips `clips_for` renders."""
+    if folder is None or (Path(source) / "clip.json").is_file():
+        return 0
+    return sum(not (clip_path(folder, source, v) / "clip.json").is_file() for v in speeds)
 
 
 def check_sensors(settings: StudySettings, streams: bool) -> None:

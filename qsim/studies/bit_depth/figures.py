@@ -32,7 +32,8 @@ def study_figure(found: Study) -> bytes:
             bits, np.where(values > 0, values, np.nan), style, label=f"|{field.replace('_', ' ')}|", linestyle="-"
         )
     right.plot(bits, [row.blur_predicted / found.peak for row in rows], "k:", label="blur by the structure function")
-    left.set_ylabel("PSNR of the maximum-likelihood frame [dB]")
+    pixels = ", moving pixels" if found.moving else ""
+    left.set_ylabel(f"PSNR of the maximum-likelihood frame{pixels} [dB]")
     right.set_ylabel("rms error / peak (multibit)")
     right.set_yscale("log")
     for axes in (left, right):
@@ -54,6 +55,7 @@ def sweep_figure(found: Sweep) -> bytes:
 
     drawing = new_figure(11, 4.2)
     bits = sorted({row.bits for line in found.studies for one in line for row in one.rows})
+    pixels = ", moving pixels" if found.studies[0][0].moving else ""
     panels, colours = list(drawing.subplots(1, 2)), {"cmap": "viridis", "vmin": bits[0] - 0.5, "vmax": bits[-1] + 0.5}
     for axes, model in zip(panels, MODELS, strict=True):
         table = np.array([[s.best(model).bits for s in row] for row in found.studies])
@@ -72,7 +74,7 @@ def sweep_figure(found: Sweep) -> bytes:
         axes.set_yticks(range(len(found.speeds)), [_speed_label(found, i) for i in range(len(found.speeds))])
         axes.set_xlabel("photons per pixel and plane")
         axes.set_ylabel(f"speed (px per {CODE_BITS}-bit frame)")
-        axes.set_title(f"best bits, {model}")
+        axes.set_title(f"best bits, {model}{pixels}")
     drawing.colorbar(drawn, ax=panels, ticks=bits, label="bits; hatched: at the edge of what was tried")
     return figure_png(drawing)
 

@@ -87,7 +87,9 @@ def figure_2(clip: Clip, ppp: float, *, seed: int = 0, bits: Sequence[int] = BIT
     panels = [Panel("sharp instant", sharp, {"ppp": ppp, "peak": peak})]
     plane = BinarySPAD(1.0, 0.0)
     nothing = np.zeros(2 ** settings.bits[-1] - 1)
-    for b, frame in zip(settings.bits, expose(clip, middle, settings, level.factor, plane, nothing), strict=True):
+    everywhere = np.ones(sharp.shape, bool)
+    exposed = expose(clip, middle, settings, level.factor, plane, nothing, everywhere)
+    for b, frame in zip(settings.bits, exposed, strict=True):
         m = frame.planes
         image = Readout("planes", b, plane, clip.exposure).estimates[frame.fired.astype(np.intp)] / m
         numbers = {

@@ -35,6 +35,7 @@ class StudySettings:
     speed: int = 1  # every so many-th clip frame is a plane: the motion is so many times faster
     instants: int = 8  # largest number of output frames that are drawn and scored
     seed: int = 0
+    moving: bool = False  # score the pixels that move at the scored instant, not the whole frame
 
     def __post_init__(self) -> None:
         if not self.bits or not all(1 <= b <= 10 for b in self.bits):

@@ -16,7 +16,7 @@ from qsim.clip.photons import clip_photons
 from qsim.colour import psnr
 from qsim.files import Progress
 from qsim.studies.bit_depth.answer import answer, at_edge, code_motion, widened
-from qsim.studies.bit_depth.clip_study import Study, StudyRow, check_clip, study
+from qsim.studies.bit_depth.clip_study import Study, StudyRow, check_clip, scored_pixels, study
 from qsim.studies.bit_depth.clips import MovingClip
 from qsim.studies.bit_depth.readout import MODELS, StudySettings, readouts
 from qsim.tables import text_table
@@ -150,9 +150,12 @@ def law(base: Study, clip: Clip, settings: StudySettings, model: str, speed: flo
 
     `speed` is relative to that study. The noise is that of light that is constant during a frame.
     """
-    light = np.concatenate([clip_photons(clip, t, 1.0, sharp=True).ravel() for t in base.instants])
-    light = np.sort(light)[:: max(1, light.size // 4000)]
-    light, scale = light * (ppp / light.mean()), (ppp / base.ppp) ** 2
+    frames = {t: clip_photons(clip, t, 1.0, sharp=True) for t in base.instants}
+    whole = float(np.mean([frame.mean() for frame in frames.values()]))
+    seen = replace(settings, speed=base.speed)
+    light = np.concatenate([frame[scored_pixels(clip, t, seen)] for t, frame in frames.items()])
+    light = np.sort(light)[:: max(1, light.size // 4000)] * (ppp / whole)
+    scale = (ppp / base.ppp) ** 2
     result = {}
     for form in readouts(settings, ppp, clip.exposure):
         if form.model == model:
@@ -175,9 +178,11 @@ def _per_plane(motion: float | None, bits: int) -> float | None:
 def table(found: Study) -> list[str]:
     """Return the lines of a study's table."""
     lux = "" if found.lux is None else f", {found.lux:.3g} lx at 555 nm"
+    pixels = f" of the {100 * found.share:.3g} % of pixels that move" if found.moving else ""
     lines = [
         f"{found.clip}: {found.ppp:.4g} photons per pixel and plane{lux}; {found.frame_rate:g} planes/s, speed x"
-        f"{found.speed}, {len(found.instants)} instants; errors are rms in photons per plane, peak {found.peak:.3g}",
+        f"{found.speed}, {len(found.instants)} instants; errors are rms in photons per plane{pixels}, peak "
+        f"{found.peak:.3g}",
     ]
     header = ("model", "bits", "fps", "px/frame", "blur", "(law)", "shot", "levels", "read", "SNR dB", "PSNR dB",
               "(expected)", "+-", "sigmas", "MB/s")  # fmt: skip

@@ -98,7 +98,7 @@ def test_bits_that_were_given_are_kept_and_others_widened(clip, capsys):
     assert main(words) == 0
     found = json.loads(capsys.readouterr().out)
     assert {row["bits"] for row in found["rows"]} >= {1, 2, 3, 4, 5}
-    assert found["answer"].startswith("at 7 px per 3-bit frame and 0.1 photons per plane: ")
+    assert found["answer"].startswith("at 7 px per 3-bit frame and 0.1 photons per plane, one frame, still pixels ")
 
 
 @pytest.mark.parametrize(

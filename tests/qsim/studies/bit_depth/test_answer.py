@@ -53,8 +53,9 @@ def test_a_clip_is_made_faster_by_whole_factors(clip, tmp_path, capsys):
         answer.step_for(3.0, still)
     assert main(["tradeoff", str(clip.path), "--px", "14", "--ppp", "0.65", "--bits", "1,2"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "--px 14: speed factor 2 gives 14 px per 3-bit frame (7 planes), mean of what moves"
-    assert lines[-1].startswith("at 14 px per 3-bit frame and 0.65 photons per plane: planes ")
+    assert lines[0] == "--px 14: speed factor 2"
+    assert lines[-1].startswith("at 14 px per 3-bit frame and 0.65 photons per plane, one frame, pixels that move: ")
+    assert "; after restoring 1 bit, 2 bits are " in lines[-1]
 
 
 def test_an_optimum_at_the_edge_is_marked(clip):

@@ -1,11 +1,16 @@
 """Tests the bit-depth study of one clip: simulated errors against their expectations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from stats import critical_z
 from waves import wave_clip
 
 from qsim.cli.program import main
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
+from qsim.clip.writer import ClipWriter
 from qsim.report import clip_section
 from qsim.studies.bit_depth import answer, clip_study
 from qsim.studies.bit_depth.clip_study import study
@@ -63,7 +68,7 @@ def test_shot_noise_of_a_sum_is_that_of_its_light(found):
 def test_deeper_frames_hold_the_planes_of_shallower_ones(clip):
     settings = StudySettings(bits=(1, 2, 3), ppp=0.65)
     plane = plane_sensor(settings, 0.65, clip.exposure)
-    frames = list(clip_study.expose(clip, 20, settings, 0.65, plane, np.zeros(7)))
+    frames = list(clip_study.expose(clip, 20, settings, 0.65, plane, np.zeros(7), np.ones(clip.shape[1:], bool)))
     assert [frame.planes for frame in frames] == [1, 3, 7]
     assert (frames[0].fired <= frames[1].fired).all()
     assert (frames[1].fired <= frames[2].fired).all()
@@ -99,3 +104,33 @@ def test_one_definition_of_motion(tmp_path):
     assert 7 * clip_study.clip_motion(clip, 3) == pytest.approx(14)
     line = clip_section.motion_line(clip, range(4))
     assert "move 2 px/frame on average (14 px per 3-bit frame of 7 planes)" in line
+
+
+def test_still_pixels_do_not_count_among_moving_ones(tmp_path, monkeypatch):
+    """A third of the field rests: blur is that of the others, and light and peak stay those of the clip."""
+    clip = wave_clip(tmp_path / "third", 32, 2, still=16)
+    settings = StudySettings(bits=(1, 3), ppp=0.65, instants=2)
+    every, moving = study(clip, settings), study(clip, replace(settings, moving=True))
+    assert (every.share, moving.share) == (1.0, pytest.approx(2 / 3))
+    assert (every.ppp, every.peak) == (moving.ppp, moving.peak)
+    for one, other in zip(every.rows, moving.rows, strict=True):
+        assert one.blur_error**2 == pytest.approx(2 / 3 * other.blur_error**2)
+        assert one.motion_px_per_frame == other.motion_px_per_frame
+        assert other.blur_predicted == pytest.approx(other.blur_error, rel=2e-3, abs=1e-6)
+    monkeypatch.setattr(clip_study, "moving_pixels", lambda length, planes: np.zeros(length.shape, bool))
+    with pytest.raises(ValueError, match=r"no pixel moves at its frames \d+, \d+, which would be scored; give more"):
+        study(clip, replace(settings, moving=True))
+
+
+def test_the_motion_of_a_clip_does_not_depend_on_the_depths(tmp_path):
+    """Deep frames are scored at few instants; the motion is the mean over the clip all the same."""
+    meta = {"shape": [32, 8, 8], "frame_rate": 10_000.0, "exposure": 1e-4, "radiance_unit": RELATIVE}
+    with ClipWriter(tmp_path / "faster", meta) as writer:
+        for t in range(32):
+            flow = np.full((2, 8, 8), [[[0.1 * t]], [[0.0]]], np.float32)
+            truth = {"flow": flow, "flow_back": -flow, "valid": np.ones((8, 8), bool)}
+            writer.add(t, np.ones((8, 8), np.float32), truth=truth)
+    clip = Clip.open(tmp_path / "faster")
+    shallow, deep = (study(clip, StudySettings(bits=bits, ppp=1.0)) for bits in ((1,), (5,)))
+    assert answer.code_motion(shallow.rows[0]) == pytest.approx(answer.code_motion(deep.rows[0]))
+    assert answer.code_motion(deep.rows[0]) == pytest.approx(7 * 0.1 * np.mean([0, 10, 21, 31]))

@@ -10,6 +10,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons, light_level
 from qsim.dataset.redraw import redraw
 from qsim.rendering import clip_rendering, fidelity
+from qsim.studies.bit_depth import clips
 from qsim.studies.bit_depth.clips import ClipShape, clips_for, group, render, write_streams
 from qsim.studies.bit_depth.readout import StudySettings
 from qsim.studies.readouts import compare
@@ -129,3 +130,20 @@ def test_streams_of_a_crop_have_the_noise_of_its_place(tmp_path):
     (path,) = write_streams(clip, tmp_path, StudySettings(bits=(3,), ppp=0.65))
     found = Clip.open(path)
     assert found.stream("planes").origin == found.stream("multibit").origin == (8, 12)
+
+
+def test_progress_counts_the_frames_of_all_clips_that_are_rendered(tmp_path, monkeypatch):
+    """Three speeds, one of them rendered before: the other two make up the whole."""
+    (tmp_path / "clips" / "fan_x2").mkdir(parents=True)
+    (tmp_path / "clips" / "fan_x2" / "clip.json").touch()
+
+    def rendered(name, path, shape, *, speed, progress):
+        for t in range(shape.frames if progress is not None else 0):
+            progress(t + 1, shape.frames)
+
+    monkeypatch.setattr(clips, "render", rendered)
+    told = []
+    wanted = [1.0, 2.0, 3.0]
+    list(clips_for("fan", wanted, ClipShape(4), tmp_path, lambda done, total: told.append((done, total))))
+    assert told == [(done, 8) for done in range(1, 9)]
+    assert clips.to_render("fan", wanted, tmp_path) == 2
