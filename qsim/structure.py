@@ -202,6 +202,7 @@ CAMERA: Table = {
         "k2": NUMBER,
         "falloff": expected("a list of numbers", list_of(is_number)),
         "shift": expected("two numbers", list_of(is_number, 2)),
+        **{f"{key}, if any": NUMBER for key in ("k3", "k4", "p1", "p2", "aspect")},
     },
 }
 

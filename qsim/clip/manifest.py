@@ -60,7 +60,7 @@ def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:
             values[key] = tuple(values[key])
     try:
         if values.get("lens") is not None:
-            lens = {key: value for key, value in values["lens"].items() if key != "kind"}
+            lens = {key: value for key, value in values["lens"].items() if key != "kind" and value is not None}
             values["lens"] = Lens(**lens | {key: tuple(lens[key]) for key in ("falloff", "shift")})
         return Camera(**values)
     except (TypeError, ValueError) as error:

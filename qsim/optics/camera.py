@@ -31,7 +31,7 @@ class Camera:
 
     focal_length: float  # m
     f_number: float  # focal length / entrance pupil diameter
-    pixel_pitch: float  # m
+    pixel_pitch: float  # m; the height of a pixel, and its width unless `lens` has an aspect
     height: int  # pixels
     width: int  # pixels
     transmission: float = 1.0  # of lens and filters, above 0, at most 1
@@ -90,7 +90,10 @@ class Camera:
 
     @property
     def focal_pixels(self) -> float:
-        """`image_distance` in pixels, f: a point at (x, y, z) in camera axes is seen at (W/2 + f x/z, H/2 + f y/z)."""
+        """`image_distance` in heights of a pixel, f: (x, y, z) in camera axes is seen at (W/2 + f x/z, H/2 + f y/z).
+
+        Where the lens has an aspect, pixels are not square, and f x/z is times the aspect.
+        """
         return self.image_distance / self.pixel_pitch
 
     @property
@@ -106,14 +109,25 @@ class Camera:
 
     @property
     def corner(self) -> float:
-        """Length of the slope at which the farthest corner of the picture is seen."""
-        away = [max(at, size - at) for at, size in zip(self.axis, (self.width, self.height), strict=True)]
-        return math.hypot(*away) / self.focal_pixels
+        """Length of the slope at which the farthest corner of the picture is seen, before its aspect widens it."""
+        across, down = (max(at, size - at) for at, size in zip(self.axis, (self.width, self.height), strict=True))
+        return math.hypot(across / self.aspect, down) / self.focal_pixels
+
+    @property
+    def aspect(self) -> float:
+        """A pixel's height over its width: fl_x over fl_y."""
+        return 1.0 if self.lens is None else self.lens.aspect
+
+    @property
+    def pixel_area(self) -> float:
+        """Photosensitive area of a pixel [m^2]; `pixel_pitch` is its height."""
+        return self.fill_factor * self.pixel_pitch**2 / self.aspect
 
     def circle_of_confusion(self, depth: np.ndarray) -> np.ndarray:
         """Return the diameter [px] of the blur of points at `depth` [m] along the axis, [...], with `aperture_blur`.
 
-        It is A f |z - s| / (z |s - f|) for the focal length f, the pupil's diameter A and the focus s.
+        It is A f |z - s| / (z |s - f|) for the focal length f, the pupil's diameter A and the focus s, counted in
+        heights of a pixel.
         """
         depth = np.asarray(depth, np.float64)
         scale = self.focal_length / abs(self.focus - self.focal_length) / self.pixel_pitch

@@ -26,7 +26,7 @@ def airy_diameter(camera: Camera) -> float:
 
 
 def mtf(frequency: Array, camera: Camera) -> Array:
-    """Return the contrast [...] of an ideal round aperture at `frequency` [...] [cycles per pixel].
+    """Return the contrast [...] of an ideal round aperture at `frequency` [...] [cycles per height of a pixel].
 
     Source: Goodman, Fourier Optics, section 6.4.
     """
@@ -57,7 +57,7 @@ def blurred(image: Array, camera: Camera) -> Array:
     from scipy import fft
 
     down, across = (np.arange(size) / (2 * size) for size in image.shape)  # cycles/px of a cosine transform
-    contrast = mtf(np.hypot(down[:, None], across), camera)
+    contrast = mtf(np.hypot(down[:, None], across * camera.aspect), camera)
     spectrum = fft.dctn(plain(image, np.float64), norm="ortho")
     answer: Array = fft.idctn(spectrum * contrast, norm="ortho")
     return answer

@@ -103,8 +103,7 @@ def to_photons(irradiance: Array, camera: Camera, exposure: float) -> Array:
 
     All light has the camera's wavelength.
     """
-    area = camera.fill_factor * camera.pixel_pitch**2
-    return np.asarray(irradiance, np.float64) * (area * exposure / photon_energy(camera.wavelength))
+    return np.asarray(irradiance, np.float64) * (camera.pixel_area * exposure / photon_energy(camera.wavelength))
 
 
 def expected_photons(
@@ -168,8 +167,7 @@ def illumination(
 
 def photons_per_lux(camera: Camera, exposure: float) -> float:
     """Return photons per pixel in `exposure` [s] for one lux of 555 nm on the faceplate: 2.47 for 1.1 um and 0.5 ms."""
-    area = camera.fill_factor * camera.pixel_pitch**2
-    return area * exposure / (LUMINOUS_EFFICACY * photon_energy(LUX_WAVELENGTH))
+    return camera.pixel_area * exposure / (LUMINOUS_EFFICACY * photon_energy(LUX_WAVELENGTH))
 
 
 def photopic(bands: Sequence[float]) -> float:

@@ -14,6 +14,7 @@ from qsim.optics.lens import Lens
 from qsim.optics.radiometry import Crop
 
 MAX_SAMPLES_IN_FLIGHT = 2**23  # samples in flight, about; a frame with more is rendered in parts
+GRID = 129  # columns and lines of slopes known to a lens with tangential terms; the same test measures the rest
 KNOWN = 1024  # radii of the picture whose rays are known; tests/qsim/rendering/test_camera_rays.py measures the rest
 
 
@@ -77,7 +78,9 @@ class CameraRays:
     def __init__(self, mi: Any, camera: Camera) -> None:
         self._mi, self._camera = mi, camera
         lens = camera.lens
-        self._bends = _Bends(mi, camera, lens) if lens is not None and lens.distorts else None
+        self._bends: _Bends | _Warp | None = None
+        if lens is not None and lens.bends:
+            self._bends = _Warp(mi, camera, lens) if lens.tangential else _Bends(mi, camera, lens)
 
     def through(self, pose: Array, position: Any, sampler: Any) -> Any:
         """Return rays through film positions [px]; the pose is data, not code, so that motion compiles no kernel."""
@@ -86,7 +89,7 @@ class CameraRays:
         mi, camera = self._mi, self._camera
         axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in pose[:3, i])) for i in range(4)]
         f, (x, y) = camera.focal_pixels, camera.axis
-        across = (position.x - x) / f
+        across = (position.x - x) / (f * camera.aspect)
         down = (position.y - y) / f
         if self._bends is not None:
             across, down = self._bends.traced(across, down)
@@ -102,7 +105,7 @@ class CameraRays:
 
 
 class _Bends:
-    """`Lens.traced` for Dr.Jit: a start between two known radii, and one step of Newton's method."""
+    """`Lens.traced` of radial terms for Dr.Jit: a start between two known radii, and one step of Newton's method."""
 
     def __init__(self, mi: Any, camera: Camera, lens: Lens) -> None:
         import drjit as dr
@@ -110,7 +113,8 @@ class _Bends:
         far = 1.0001 * camera.corner  # rounding of film positions
         stretch = lens.traced_radius(np.linspace(0.0, far, KNOWN)[1:]) / np.linspace(0.0, far, KNOWN)[1:]
         self._stretch = mi.Float(np.concatenate([[1.0], stretch]).astype(np.float32))
-        self._k1, self._k2, self._step = (dr.opaque(mi.Float, v) for v in (lens.k1, lens.k2, far / (KNOWN - 1)))
+        self._terms = _radial_terms(mi, lens)
+        self._step = dr.opaque(mi.Float, far / (KNOWN - 1))
         self._mi = mi
 
     def traced(self, across: Any, down: Any) -> tuple[Any, Any]:
@@ -123,7 +127,77 @@ class _Bends:
         start, end = dr.gather(self._mi.Float, self._stretch, left), dr.gather(self._mi.Float, self._stretch, left + 1)
         stretch = start + (end - start) * (place - self._mi.Float(left))
         square = dr.square(seen * stretch)
-        # The stretch s of the slope seen: s (1 + k1 (s seen)^2 + k2 (s seen)^4) = 1
-        off = stretch * (1 + square * (self._k1 + square * self._k2)) - 1
-        stretch -= off / (1 + square * (3 * self._k1 + 5 * self._k2 * square))
+        # The stretch s of the slope seen: s (1 + k1 (s seen)^2 + k2 (s seen)^4 + ...) = 1
+        off = stretch * (1 + square * _sum_of_powers(self._terms, square)) - 1
+        rise = [(2 * i + 3) * term for i, term in enumerate(self._terms)]
+        stretch -= off / (1 + square * _sum_of_powers(rise, square))
         return across * stretch, down * stretch
+
+
+class _Warp:
+    """`Lens.traced` of all terms for Dr.Jit: a start between four known slopes, and two steps of Newton's method."""
+
+    def __init__(self, mi: Any, camera: Camera, lens: Lens) -> None:
+        import drjit as dr
+
+        (x, y), f = camera.axis, camera.focal_pixels
+        columns, lines = (np.linspace(0.0, size, GRID) for size in (camera.width, camera.height))
+        places = np.stack(np.meshgrid((columns - x) / f, (lines - y) / f), axis=-1)
+        known = lens.traced(places).astype(np.float32)
+        self._across, self._down = (mi.Float(np.ascontiguousarray(known[..., i]).ravel()) for i in range(2))
+        first, step = places[0, 0] / (lens.aspect, 1), (places[1, 1] - places[0, 0]) / (lens.aspect, 1)
+        self._first, self._step = ([dr.opaque(mi.Float, float(n)) for n in pair] for pair in (first, step))
+        self._terms = _radial_terms(mi, lens)
+        self._p1, self._p2 = (dr.opaque(mi.Float, float(term)) for term in (lens.p1, lens.p2))
+        self._mi = mi
+
+    def traced(self, across: Any, down: Any) -> tuple[Any, Any]:
+        """Return the slopes of the rays that are seen at these slopes, before the aspect widens them."""
+        return self._nearer(*self._nearer(*self._start(across, down), across, down), across, down)
+
+    def _nearer(self, x: Any, y: Any, across: Any, down: Any) -> tuple[Any, Any]:
+        """Return slopes after a step of Newton's method from (x, y) to those that are seen at (across, down)."""
+        import drjit as dr
+
+        square = x * x + y * y
+        stretch = 1 + square * _sum_of_powers(self._terms, square)
+        along = 2 * (self._p2 * x + self._p1 * y)
+        off_x = x * (stretch + along) + square * self._p2 - across
+        off_y = y * (stretch + along) + square * self._p1 - down
+        slope = 2 * _sum_of_powers([(i + 1) * term for i, term in enumerate(self._terms)], square)
+        xx = stretch + x * x * slope + along + 4 * self._p2 * x
+        yy = stretch + y * y * slope + along + 4 * self._p1 * y
+        xy = x * y * slope + 2 * (self._p1 * x + self._p2 * y)
+        area = xx * yy - dr.square(xy)
+        return x - (yy * off_x - xy * off_y) / area, y - (xx * off_y - xy * off_x) / area
+
+    def _start(self, across: Any, down: Any) -> tuple[Any, Any]:
+        """Return slopes between those of the four nearest known places."""
+        import drjit as dr
+
+        mi = self._mi
+        at_x, at_y = (across - self._first[0]) / self._step[0], (down - self._first[1]) / self._step[1]
+        column, line = (dr.minimum(mi.UInt32(dr.maximum(at, 0)), GRID - 2) for at in (at_x, at_y))
+        right, below = at_x - mi.Float(column), at_y - mi.Float(line)
+        found = []
+        for known in (self._across, self._down):
+            corner = [dr.gather(mi.Float, known, line * GRID + column + more) for more in (0, 1, GRID, GRID + 1)]
+            top, bottom = (corner[i] + (corner[i + 1] - corner[i]) * right for i in (0, 2))
+            found.append(top + (bottom - top) * below)
+        return found[0], found[1]
+
+
+def _radial_terms(mi: Any, lens: Lens) -> list[Any]:
+    """Return k1 and k2 as data, and k3 and k4 if one of them counts: a lens without them compiles as it always did."""
+    import drjit as dr
+
+    more = (lens.k3, lens.k4) if lens.k3 or lens.k4 else ()
+    return [dr.opaque(mi.Float, float(term)) for term in (lens.k1, lens.k2, *more)]
+
+
+def _sum_of_powers(terms: list[Any], square: Any) -> Any:
+    """Return terms[0] + terms[1] square + terms[2] square^2 + ..."""
+    found = terms[-1]
+    for term in reversed(terms[:-1]):
+        found = term + square * found
+    return found

@@ -328,8 +328,10 @@ def _lens(camera: Camera) -> tuple[Finding, ...]:
     """Return a finding for a lens that is not ideal: how far it moves the corner, and the light left there."""
     if camera.lens is None:
         return ()
-    corner = np.array([camera.corner, 0.0])
-    moved = float(corner[0] - camera.lens.traced(corner)[0]) * camera.focal_pixels
+    away = [max((at, at - size), key=abs) for at, size in zip(camera.axis, (camera.width, camera.height), strict=True)]
+    corner = -np.array(away) / camera.focal_pixels
+    ideal = camera.lens.traced(corner) * (camera.aspect, 1.0)
+    moved = float(np.hypot(*corner) - np.hypot(*ideal)) * camera.focal_pixels
     share = float(camera.lens.illumination(corner, natural=camera.vignetting))
     return (Finding("lens", "exact rays", f"corner moved by {moved:+.3g} px, with {100 * share:.3g} % of the light"),)
 

@@ -32,21 +32,23 @@ from qsim.structure import FLAG, NUMBER, POSITIVE, TEXT, Table, expected, is_num
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: y up, z back <-> y down, z forward
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # world: z up -> y up
 SKEW = 1e-3  # by which the axes of a pose may fail to be orthonormal; the nearest rotation is taken
-SQUARE = 1e-6  # relative difference of fl_x and fl_y
+SQUARE = 1e-6  # relative difference of fl_x and fl_y up to which pixels are square
 SQUARE_BY_ANGLE = 1e-3  # the same of focal lengths from angles of view, which files state rounded
 MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "PERSPECTIVE")
 PLAIN = Camera(focal_length=1e-3, f_number=2.8, pixel_pitch=1.1e-6, height=1, width=1)  # its size does not count
-ZERO = ("k3", "k4", "p1", "p2")  # terms of lenses that are not modelled
+TERMS = ("k1", "k2", "k3", "k4", "p1", "p2")
+ZERO = ("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew")  # terms of lenses that are not modelled
+OTHER_LENSES = ("is_fisheye", "latlong", "equirectangular", "orthographic")  # flags of other projections
 
 _SIZE = expected("a whole number of pixels", lambda v: is_number(v) and v == int(v) and 1 <= v <= MAX_PIXELS)
 _ANGLE = expected("an angle of view from 0 to pi [rad]", lambda v: is_number(v) and 1e-6 <= v <= 3.14)
 _LENS: Table = {
     **{f"{key}, if any": _SIZE for key in ("w", "h")},
     **{f"{key}, if any": POSITIVE for key in ("fl_x", "fl_y")},
-    **{f"{key}, if any": NUMBER for key in ("cx", "cy", "k1", "k2", *ZERO)},
+    **{f"{key}, if any": NUMBER for key in ("cx", "cy", *TERMS, *ZERO)},
     **{f"{key}, if any": _ANGLE for key in ("camera_angle_x", "camera_angle_y")},
     "camera_model, if any": TEXT,
-    "is_fisheye, if any": FLAG,
+    **{f"{key}, if any": FLAG for key in OTHER_LENSES},
 }
 _KEYS = tuple(key.removesuffix(", if any") for key in _LENS)
 _FILE: Table = {
@@ -80,8 +82,10 @@ def read_camera_path(
     `frame_rate`; `speed` is a factor on that. `scale` is the length of the file's unit [m]. `motion` starts at the
     first pose, in the camera's own axes: another camera that takes it moves alike.
 
-    `FileNotFoundError`, or `ValueError` for less than two poses, a pose that is no rotation, pixels that are not
-    square, lenses of several cameras, fisheye and tangential lenses.
+    Where fl_x and fl_y differ, pixels are as high as in `like`, and fl_x / fl_y times narrower.
+
+    `FileNotFoundError`, or `ValueError` for less than two poses, a pose that is no rotation, lenses of several cameras,
+    fisheye lenses and other models, all of them named at once.
     """
     where = str(path)
     if not Path(path).is_file():
@@ -128,14 +132,15 @@ def camera_path(
         "camera_model": "OPENCV",
         "w": camera.width,
         "h": camera.height,
-        "fl_x": camera.focal_pixels,
+        "fl_x": camera.focal_pixels * lens.aspect,
         "fl_y": camera.focal_pixels,
         "cx": x - origin[1],
         "cy": y - origin[0],
         "k1": float(lens.k1),
         "k2": float(lens.k2),
-        "p1": 0.0,
-        "p2": 0.0,
+        **{key: float(term) for key, term in (("k3", lens.k3), ("k4", lens.k4)) if term},
+        "p1": float(lens.p1),
+        "p2": float(lens.p2),
         "frame_rate": float(frame_rate),
         "frames": [
             {"file_path": name, "transform_matrix": (pose + 0.0).tolist()}
@@ -214,11 +219,12 @@ def _seen_from(found: dict[str, Any], where: str, like: Camera, pose: Array, siz
     height, width = int(stated.get("h", like.height)), int(stated.get("w", like.width))
     if "fl_x" not in stated and "camera_angle_x" not in stated:
         raise ValueError(f"{where}: states neither fl_x nor camera_angle_x; one of them gives the view")
-    focal = stated.get("fl_x") or width / 2 / math.tan(stated["camera_angle_x"] / 2)
+    focal, aspect = _focal(stated, width)
     shift = ((stated.get("cx", width / 2) - width / 2) / height, (stated.get("cy", height / 2) - height / 2) / height)
-    bent = Lens(stated.get("k1", 0.0), stated.get("k2", 0.0), () if like.lens is None else like.lens.falloff, shift)
+    falloff = () if like.lens is None else like.lens.falloff
     distance, ahead = focal * like.pixel_pitch, like.focus
     try:
+        bent = Lens(falloff=falloff, shift=shift, aspect=aspect, **{key: stated.get(key, 0.0) for key in TERMS})
         return replace(
             like,
             height=height,
@@ -242,32 +248,27 @@ def _check_lens(content: dict[str, Any], frames: list[dict[str, Any]], found: di
     model = stated.get("camera_model", "OPENCV")
     if model not in MODELS:
         blocking.append(f"camera_model is {model!r:.40} (read are {', '.join(MODELS)})")
-    if stated.get("is_fisheye"):
-        blocking.append("is_fisheye is true (only perspective lenses are read)")
-    blocking += [f"{key} is {stated[key]:g} (k1 and k2 are modelled)" for key in ZERO if stated.get(key, 0) != 0]
-    blocking += _not_square(stated)
+    blocking += [f"{key} is true (only perspective lenses are read)" for key in OTHER_LENSES if stated.get(key)]
+    blocking += [f"{key} is {stated[key]:g} (modelled are {', '.join(TERMS)})" for key in ZERO if stated.get(key)]
     differing = [key for key in _KEYS if _differs(frames, key)]
     if differing:
         blocking.append(f"frames differ in {', '.join(differing)} (a path has one lens)")
     if blocking:
         cures = {
             "frames differ": "split the file by cameras, or calibrate with one shared camera",
-            "": "calibrate with COLMAP's model RADIAL, or undistort the pictures (COLMAP's image_undistorter)",
+            "": "calibrate with COLMAP's model OPENCV, or undistort the pictures (COLMAP's image_undistorter)",
         }
         cure = cures["frames differ" if len(blocking) == bool(differing) else ""]
         raise ValueError(f"{where}: {'; '.join(blocking)}: {cure}")
 
 
-def _not_square(stated: dict[str, Any]) -> list[str]:
-    """Return a line on focal lengths that differ along x and y; pixels are square here."""
+def _focal(stated: dict[str, Any], width: int) -> tuple[float, float]:
+    """Return the focal length [heights of a pixel] of a picture of this width [px], and fl_x over fl_y."""
+    across = stated.get("fl_x") or width / 2 / math.tan(stated["camera_angle_x"] / 2)
     if {"fl_x", "fl_y"} <= stated.keys():
-        along, down, allowed = stated["fl_x"], stated["fl_y"], SQUARE
-    elif {"w", "h", "camera_angle_y"} <= stated.keys() and {"fl_x", "camera_angle_x"} & stated.keys():
-        along = stated.get("fl_x") or stated["w"] / 2 / math.tan(stated["camera_angle_x"] / 2)
-        down = stated["h"] / 2 / math.tan(stated["camera_angle_y"] / 2)
-        allowed = SQUARE_BY_ANGLE
+        down, allowed = stated["fl_y"], SQUARE
+    elif {"w", "h", "camera_angle_y"} <= stated.keys():
+        down, allowed = stated["h"] / 2 / math.tan(stated["camera_angle_y"] / 2), SQUARE_BY_ANGLE
     else:
-        return []
-    if abs(down / along - 1) <= allowed:
-        return []
-    return [f"the focal length is {along:g} px along x and {down:g} px along y (pixels are square here)"]
+        return across, 1.0
+    return (across, 1.0) if abs(down / across - 1) <= allowed else (down, across / down)

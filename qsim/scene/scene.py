@@ -233,8 +233,8 @@ def describe(value: Any) -> Any:
 
 
 def _is_told(record: Any, field: dataclasses.Field[Any]) -> bool:
-    """Return whether a description holds a field: not where it is marked "if any" and None."""
-    return "described" not in field.metadata or getattr(record, field.name) is not None
+    """Return whether a description holds a field: not where it is marked "if any" and has its default."""
+    return "described" not in field.metadata or getattr(record, field.name) != field.default
 
 
 def _check_motion(scene: str, body: Body | Part) -> None:

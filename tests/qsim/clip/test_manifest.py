@@ -60,9 +60,12 @@ def test_a_damaged_manifest_is_named(tmp_path: Path):
 
 
 def test_a_lens_is_stored_and_read_again(tmp_path: Path):
-    lens = Lens(-0.2, 0.1, (-0.3, 0.1), (0.02, -0.01))
-    camera = Camera(8e-3, 2.8, 1.1e-6, 10, 7, lens=lens)
-    assert write(tmp_path / "a", camera=describe(camera)).camera.lens == lens
+    radial = Lens(-0.2, 0.1, (-0.3, 0.1), (0.02, -0.01))
+    camera = Camera(8e-3, 2.8, 1.1e-6, 10, 7, lens=radial)
+    every = dataclasses.replace(radial, k3=0.03, k4=-0.02, p1=0.002, p2=-0.001, aspect=1.1)
+    for i, lens in enumerate((radial, every)):
+        stored = describe(dataclasses.replace(camera, lens=lens))
+        assert write(tmp_path / str(i), camera=stored).camera.lens == lens
     ideal = describe(dataclasses.replace(camera, lens=None))
     assert "lens" not in ideal
     assert write(tmp_path / "b", camera=ideal).camera.lens is None
@@ -71,8 +74,8 @@ def test_a_lens_is_stored_and_read_again(tmp_path: Path):
 def test_a_damaged_lens_is_named(tmp_path: Path):
     clip = write(tmp_path / "a")
     good = {"k1": -0.2, "k2": 0.1, "falloff": [], "shift": [0.0, 0.0]}
-    for damage in ({"k1": "x"}, {"falloff": 3}, {"shift": [1.0]}, {"falloff": [None]}, {"k3": 0.1}, {"k1": -1e9}):
+    for damage in ({"k1": "x"}, {"falloff": 3}, {"shift": [1.0]}, {"falloff": [None]}, {"k5": 0.1}, {"k1": -1e9}):
         camera = clip.meta["camera"] | {"lens": good | damage}
         files.write_description(clip.path / "clip.json", clip.meta | {"camera": camera})
-        with pytest.raises(ValueError, match=r"clip\.json.*lens|clip\.json: camera: .*k3"):
+        with pytest.raises(ValueError, match=r"clip\.json.*lens|clip\.json: camera: .*k5"):
             assert Clip.open(clip.path).camera

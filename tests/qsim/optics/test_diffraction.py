@@ -8,6 +8,7 @@ from scipy import integrate, signal, special
 
 from qsim.optics.camera import Camera
 from qsim.optics.diffraction import airy_diameter, blurred, diffract, diffraction_line, mtf
+from qsim.optics.lens import Lens
 
 CAMERA = Camera(focal_length=8e-3, f_number=2.8, pixel_pitch=1.1e-6, height=10, width=7, wavelength=550e-9)
 CLOSE = 0.01  # of the contrast, as the documents promise up to 0.45 cycles per pixel
@@ -81,6 +82,16 @@ def test_slanted_bars_keep_the_contrast_of_a_fine_airy_pattern(f_number, frequen
     along = waves(size, frequency, angle)
     found = contrast(diffract(pixels(bars.astype(float)), camera), along, 24)
     assert found == pytest.approx(contrast(pixels(seen), along, 24), rel=CLOSE)
+
+
+def test_narrow_pixels_are_blurred_over_more_of_them():
+    """Pixels half as wide see a wave of f cycles/px as square ones see one of 2 f across; down nothing changes."""
+    narrow = dataclasses.replace(CAMERA, lens=Lens(aspect=2.0))
+    x = np.arange(64) + 0.5
+    across, down = (np.cos(2 * np.pi * f * x)[None] * np.ones((8, 1)) for f in (0.125, 0.25))
+    scale = np.ptp(blurred(down, CAMERA)) / np.ptp(down)
+    np.testing.assert_allclose(blurred(across, narrow), across * scale, atol=1e-12)
+    np.testing.assert_allclose(blurred(down.T, narrow), blurred(down.T, CAMERA), atol=1e-12)
 
 
 def test_light_is_kept_and_nowhere_below_zero():

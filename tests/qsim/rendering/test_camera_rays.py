@@ -21,8 +21,14 @@ BENT = Lens(-0.25, 0.06, (-0.2,), (0.06, -0.04))
 
 
 def random_camera(rng: np.random.Generator, **changes) -> Camera:
-    """Return a wide camera with any lens that it allows."""
+    """Return a wide camera with any lens that it allows: radial, with more terms, or with all of them."""
     lens = Lens(*rng.uniform(-0.2, 0.4, 2), (float(rng.uniform(-0.5, 0.1)),), tuple(rng.uniform(-0.1, 0.1, 2)))
+    some = int(rng.integers(3))
+    if some:
+        lens = replace(lens, k3=float(rng.uniform(0, 0.1)), k4=float(rng.uniform(0, 0.1)))
+    if some == 2:
+        p1, p2, aspect = rng.uniform((-0.03, -0.03, 0.8), (0.03, 0.03, 1.25))
+        lens = replace(lens, p1=float(p1), p2=float(p2), aspect=float(aspect))
     return replace(CAMERA, focal_length=float(rng.uniform(1.6e-3, 3e-3)), lens=lens, **changes)
 
 
@@ -149,7 +155,7 @@ def test_light_behind_a_lens_falls_off_once():
 def test_distortion_does_not_change_the_light_of_a_body():
     """A spot wholly inside the picture sends as many photons through any distortion."""
     totals = []
-    for lens in (None, Lens(-0.3), Lens(0.5, 0.2), Lens(0.1, shift=(0.1, 0.05))):
+    for lens in (None, Lens(-0.3), Lens(0.5, 0.2), Lens(0.1, shift=(0.1, 0.05)), Lens(p1=0.03, p2=0.06, aspect=0.8)):
         camera = replace(CAMERA.resized(48, 66), lens=lens)
         made = glowing(0.5, (0.6, -0.5, 1.0), camera)
         frame = renderer(made, budget=Budget(256, 1)).frame(0)
@@ -171,7 +177,7 @@ def test_the_scalar_engine_refuses_what_it_has_not():
         for name in (None, "scalar")
     )
     assert ours.mean() == pytest.approx(theirs.mean(), rel=0.03)
-    for lens in (Lens(0.1), Lens(shift=(0.1, 0.0))):
+    for lens in (Lens(0.1), Lens(shift=(0.1, 0.0)), Lens(aspect=1.1)):
         made = plate(None, camera=replace(CAMERA, lens=lens))
         with pytest.raises(ValueError, match=r"which the scalar engine .* has no distortion and no shift"):
             renderer(made, engine=choose("scalar")).frame(0)

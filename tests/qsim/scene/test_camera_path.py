@@ -37,7 +37,9 @@ def written(path: Path, **changes: Any) -> Path:
 
 def random_camera(rng: np.random.Generator) -> Camera:
     motion = Spin(tuple(rng.normal(size=3)), float(rng.uniform(0, 2000))) @ Translation(tuple(rng.normal(size=3) * 10))
-    lens = Lens(*rng.uniform(-0.02, 0.02, 2), shift=tuple(rng.normal(size=2) * 0.1))
+    terms = dict(zip(("k3", "k4", "p1", "p2"), rng.uniform(0, 1e-3, 4) * rng.integers(0, 2, 4), strict=True))
+    aspect = 1.0 + float(rng.uniform(-0.2, 0.2) * rng.integers(0, 2))
+    lens = Lens(*rng.uniform(-0.02, 0.02, 2), shift=tuple(rng.normal(size=2) * 0.1), aspect=aspect, **terms)
     origin, target, up = (tuple(rng.normal(size=3)) for _ in range(3))
     height, width = (int(n) for n in rng.integers(1, 600, 2))
     return Camera(2e-3, 2.8, 3e-6, height, width, lens=lens, origin=origin, target=target, up=up, motion=motion)
@@ -113,6 +115,30 @@ def test_what_files_of_other_programs_state_is_read(tmp_path: Path):
     assert read_camera_path(slow, frame_rate=5.0).pose(0.2)[0, 3] == pytest.approx(1)
 
 
+def test_every_term_of_a_calibration_is_modelled(tmp_path: Path):
+    """fl_x, fl_y, cx, cy, k1 to k4, p1 and p2 as COLMAP and nerfstudio state them, against the formula of OpenCV."""
+    stated = {"fl_x": 61.0, "fl_y": 52.5, "cx": 33.7, "cy": 21.2, "k1": -0.21, "k2": 0.07, "k3": 0.012, "k4": -0.003}
+    stated |= {"p1": 0.011, "p2": -0.008}
+    camera = read_camera_path(written(tmp_path / "p.json", **stated, camera_model="OPENCV"))
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(-0.5, 0.5, (2, 200))
+    r2 = x * x + y * y
+    radial = 1 + stated["k1"] * r2 + stated["k2"] * r2**2 + stated["k3"] * r2**3 + stated["k4"] * r2**4
+    bent_x = x * radial + 2 * stated["p1"] * x * y + stated["p2"] * (r2 + 2 * x * x)
+    bent_y = y * radial + stated["p1"] * (r2 + 2 * y * y) + 2 * stated["p2"] * x * y
+    expected = np.stack([stated["fl_x"] * bent_x + stated["cx"], stated["fl_y"] * bent_y + stated["cy"]], axis=-1)
+    pose = camera.pose(0.1)
+    points = np.column_stack([x, y, np.ones_like(x)]) * 3.0 @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(camera.project(points, 0.1)[0], expected, atol=1e-10)
+    assert camera.pixel_area == pytest.approx(1.1e-6**2 * 52.5 / 61.0)
+
+
+def test_focal_lengths_of_two_angles_are_modelled(tmp_path: Path):
+    camera = read_camera_path(written(tmp_path / "a.json", **ANGLES, camera_angle_x=0.8, camera_angle_y=0.8))
+    assert camera.focal_pixels == pytest.approx(240 / math.tan(0.4))
+    assert camera.focal_pixels * camera.aspect == pytest.approx(320 / math.tan(0.4))
+
+
 def test_rounded_angles_of_square_pixels_are_read(tmp_path: Path):
     """The vertical angle was not read; without a size it belongs to pictures of another shape, and is not compared."""
     angles = {"camera_angle_x": 0.8, "camera_angle_y": round(2 * math.atan(0.75 * math.tan(0.4)), 3)}
@@ -142,16 +168,13 @@ def test_a_thin_lens_keeps_its_focus_and_gets_the_view(tmp_path: Path):
         ({"camera_model": "OPENCV_FISHEYE"}, "camera_model is 'OPENCV_FISHEYE' .read are OPENCV, "),
         ({"camera_model": "ORTHOPHOTO"}, "camera_model is 'ORTHOPHOTO'"),
         ({"is_fisheye": True}, "is_fisheye is true"),
-        ({"p1": 1e-3}, "p1 is 0.001 .k1 and k2 are modelled.: calibrate with COLMAP's model RADIAL"),
+        ({"k5": 1e-3}, "k5 is 0.001 .modelled are k1, k2, .*p2.: calibrate with COLMAP's model OPENCV"),
         (
-            {"k3": 0.1, "p2": 0.2, "fl_y": 501.0, "is_fisheye": True},
-            "is_fisheye is true .*; k3 is 0.1 .*; p2 is 0.2 .*; the focal length is .* px along x and 501 px along y",
+            {"k6": 0.1, "skew": 0.2, "fl_y": 501.0, "is_fisheye": True, "camera_model": "THIN_PRISM"},
+            "camera_model is 'THIN_PRISM' .*; is_fisheye is true .*; k6 is 0.1 .*; skew is 0.2 ",
         ),
-        ({"fl_y": 501.0}, "pixels are square here"),
-        (
-            ANGLES | {"camera_angle_x": 0.8, "camera_angle_y": 0.8},
-            "756.* px along x and 567.* px along y .pixels are sq",
-        ),
+        ({"fl_y": 1.0}, "Lens.aspect, fl_x over fl_y, must be in .0.1, 10., got 500"),
+        ({"p1": 2.0}, "with p1 = 2 the picture folds at 0.04"),
         ({"fl_x": None}, "states neither fl_x nor camera_angle_x"),
         ({"w": None}, "states no w and h"),
         ({"frame_rate": None}, "states no frame_rate"),
