@@ -213,7 +213,10 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; `ValueError` as `parse_json`, also for what is no file, or no text."""
-    if path.exists() and not path.is_file():  # a pipe would be waited for
+    kind = None
+    with contextlib.suppress(OSError):  # asked once: between two questions another process may replace the file
+        kind = path.stat().st_mode
+    if kind is not None and not stat.S_ISREG(kind):  # a pipe would be waited for
         raise ValueError(f"{path}: is a folder, a pipe or a device, not a file; move it away")
     try:
         text = path.read_text(encoding="utf-8")
