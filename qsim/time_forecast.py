@@ -16,10 +16,17 @@ class TimeForecast:
     """
 
     def __init__(
-        self, what: str, say: Callable[[str], None], *, parts: int = 1, clock: Callable[[], float] = time.monotonic
+        self,
+        what: str,
+        say: Callable[[str], None],
+        *,
+        unit: str = "step",
+        parts: int = 1,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._what = what
         self._say: Callable[[str], None] | None = say  # None: it was said
+        self._unit = unit
         self._parts = parts
         self._clock = clock
         self._started = clock()
@@ -38,7 +45,7 @@ class TimeForecast:
         set_up = max(self._first[1] - self._started - self._first[0] * step, 0.0)
         whole = total * step + self._parts * set_up
         if whole > LONG:
-            self._say(f"{self._what} takes about {duration(whole)}, {step:.2g} s a step")
+            self._say(f"{self._what} takes about {duration(whole)}, {step:.2g} s a {self._unit}")
         self._say = None
 
 

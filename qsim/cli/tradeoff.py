@@ -131,7 +131,7 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     if args.streams and swept:
         raise ValueError("--streams: writes one speed and one light level; give one --ppp and one --speed or --px")
     missing = study_clips.to_render(args.source, speeds, args.output)
-    rendering = TimeForecast(f"rendering {_clips(missing)} of {shape.frames} frames", note, parts=missing)
+    rendering = TimeForecast(f"rendering {_clips(missing)} of {shape.frames} frames", note, unit="frame", parts=missing)
     with bar("rendering", first=PILOT if missing else "") as shown:
         progress = _both(shown, rendering)
         clips = list(study_clips.clips_for(args.source, speeds, shape, args.output, progress))
@@ -147,7 +147,7 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     with bar("drawing", "study" if swept else "frame") as shown:
         if swept:
             ppps = args.ppp or [first.mean_photons]
-            drawing = TimeForecast(f"drawing {len(speeds) * len(ppps)} studies", note)
+            drawing = TimeForecast(f"drawing {len(speeds) * len(ppps)} studies", note, unit="study")
             progress = _both(shown, drawing)
             found = speed_sweep.sweep(clips, ppps, settings, widen=widen, progress=progress)
             result, pictures = found.to_dict(), {"best.png": figures.sweep_figure(found)}
@@ -156,7 +156,7 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
             answers = found.answers
         else:
             asked = replace(settings, ppp=levels[0], speed=clips[0].step)
-            progress = _both(shown, TimeForecast("drawing the study", note))
+            progress = _both(shown, TimeForecast("drawing the study", note, unit="frame"))
             one = widened(first, asked, note) if widen else study(first, asked, progress=progress)
             result, pictures = speed_sweep.study_dict(one), {"tradeoff.png": figures.study_figure(one)}
             text += speed_sweep.table(one)
