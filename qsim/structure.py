@@ -296,6 +296,7 @@ STREAM: Table = {
     "drawn_by, if any": TEXT,
     "dead_time_effects, if any": OBJECT,
     "temperature, if any": NUMBER,
+    "pixel_pitch, if any": POSITIVE,
 }
 JOB: Table = {"split": SPLIT, "digest": TEXT, "scene, if any": TEXT, "state, if any": TEXT, "record, if any": DIGEST}
 DATASET: Table = {"name": TEXT, "recipe": {"recipe, if any": OBJECT}, "jobs": OBJECT}

@@ -30,6 +30,8 @@ def add_sense(sub: Any) -> None:
     light = "mean photons per pixel and code over the clip; several: 3.25,26 (default: the clip's own light)"
     parser.add_argument("--ppp", type=numbers, help=light)
     parser.add_argument("--lux", type=numbers, help="faceplate lux at 555 nm instead of --ppp")
+    pitch = "metres, of a clip without a camera (imported video), so that --lux is known: 1.1e-6"
+    parser.add_argument("--pixel-pitch", type=checked(checks.positive), help=pitch)
     parser.add_argument("--seed", type=checked(checks.seed), default=0, help="seed of the noise (default 0)")
     parser.add_argument("-o", "--name", help="name of the stream (default: made from sensor, bits and light)")
     parser.add_argument(
@@ -94,7 +96,7 @@ def _run_sense(args: argparse.Namespace) -> int:
         Sensing(args.sensor or "quiver-physical", args.bits, seed=args.seed, name=args.name, group=args.group,
                 diffraction=args.diffraction, defects=args.defects, slices=args.slices, rows=rows,
                 colour=args.colour, exposures=args.exposures, follow=args.follow,
-                temperature=args.temperature, **level)
+                temperature=args.temperature, pixel_pitch=args.pixel_pitch, **level)
         for level in levels
     ]  # fmt: skip
     clips = [clip for path in args.paths for clip in _clips(path)]
@@ -149,6 +151,7 @@ def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
         "exposures",
         "follow",
         "temperature",
+        "pixel_pitch",
         "force",
     ]
     refuse_idle(args, "--replay draws what is stored", unused)

@@ -68,6 +68,7 @@ class Clip(ClipFolder):
         exposures: tuple[float, ...] | None = None,
         follow: bool = False,
         temperature: float | None = None,
+        pixel_pitch: float | None = None,
         force: bool = False,
         progress: Progress | None = None,
     ) -> Stream:
@@ -75,15 +76,17 @@ class Clip(ClipFolder):
 
         `sensor` is a record such as `QIS(...)`, a name of `qsim doctor --devices`, or a .toml file. `ppp` is the mean
         of photons per pixel and code over the clip, `lux` [lx] the light at 555 nm instead; with neither, the clip's
-        own light is used. A colour clip needs colour filters, as in `colour="rggb"`. `Sensing` describes the other
-        settings. A stream of equal settings is not drawn again. `ValueError` for settings that do not fit the clip;
-        `FileExistsError` where `name` is taken by others.
+        own light is used. `pixel_pitch` [m] lets a clip without a camera have lux. A colour clip needs colour filters,
+        as in `colour="rggb"`. `Sensing` describes the other settings. A stream of equal settings is not drawn
+        again. `ValueError` for settings that do not fit the clip; `FileExistsError` where `name` is taken by others.
         """
         chosen = sensor if isinstance(sensor, Sensor) else os.fspath(sensor)
         defects = os.fspath(defects) if isinstance(defects, os.PathLike) else defects
         colour = os.fspath(colour) if isinstance(colour, os.PathLike) else colour
         light = (chosen, bits, ppp, lux, seed, name)
-        wanted = Sensing(*light, group, diffraction, defects, slices, rows, colour, exposures, follow, temperature)
+        wanted = Sensing(
+            *light, group, diffraction, defects, slices, rows, colour, exposures, follow, temperature, pixel_pitch
+        )
         return self.stream(sense(self, wanted, force=force, progress=progress)[0].name)
 
     @property

@@ -9,6 +9,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip_folder import ClipFolder
+from qsim.optics.camera import checked_pitch
 from qsim.optics.diffraction import diffract
 from qsim.optics.radiometry import (
     Crop,
@@ -16,38 +17,64 @@ from qsim.optics.radiometry import (
     band_photons,
     expected_photons,
     photons_per_lux,
+    photons_per_lux_of,
     photopic,
     ppp_factor,
 )
 from qsim.sensor.colour_filter import ColourFilter
 
+EXAMPLE_PITCH = 1.1e-6  # m, of a QIS: what the message about lux without a lens gives as an example
 _MOST = 1e12  # photons per pixel and frame: the exact laws are tested up to it
 
 
-def light_level(clip: ClipFolder, *, ppp: float | None = None, lux: float | None = None) -> LightLevel:
+def light_level(
+    clip: ClipFolder, *, ppp: float | None = None, lux: float | None = None, pixel_pitch: float | None = None
+) -> LightLevel:
     """Return the light level of a clip: `ppp` photons per pixel, `lux` on the faceplate, or factor 1 without either.
 
-    `ValueError` for a black clip, for both targets at once, for a clip of relative radiance without `ppp`, and above
-    1e12 photons.
+    `pixel_pitch` [m] is that of a clip without a camera (relative radiance), whose pixels are square and photosensitive
+    all over; it needs either target. `ValueError` for a black clip, for both targets at once, for such a clip without
+    a target, or with `lux` and no pitch, for a pitch beside a camera, and above 1e12 photons.
     """
     if ppp is not None and lux is not None:
         raise ValueError(f"{clip.name}: give the light level as ppp or as lux, not both")
     camera = clip.camera
     if camera is None:
-        if ppp is None:
-            what = "lux" if lux is not None else "absolute light"
-            raise ValueError(
-                f"{clip.name}: its radiance is relative (imported video) and has no {what}; "
-                "give a target in photons per pixel, as in --ppp 3.25"
-            )
-        factor = ppp_factor(clip.mean_radiance, ppp, clip.name)
-        return LightLevel(factor, _checked(clip, ppp), clip.mean_radiance, None)
+        return _relative_level(clip, ppp, lux, pixel_pitch)
+    if pixel_pitch is not None:
+        raise ValueError(
+            f"{clip.name}: its camera has pixels of {1e6 * camera.pixel_pitch:g} um; leave --pixel-pitch out"
+        )
     per_lux = photons_per_lux(camera, clip.exposure)
     if lux is not None:
         ppp = lux * per_lux
     factor = 1.0 if ppp is None else ppp_factor(clip.mean_photons, ppp, clip.name)
     level = _checked(clip, clip.mean_photons if ppp is None else ppp)
     return LightLevel(factor, level, clip.mean_photons, level / per_lux)
+
+
+def _relative_level(clip: ClipFolder, ppp: float | None, lux: float | None, pixel_pitch: float | None) -> LightLevel:
+    """Return the light level of a clip without a camera; see `light_level`."""
+    if ppp is None and lux is None:
+        raise ValueError(
+            f"{clip.name}: its radiance is relative (imported video) and has no absolute light; "
+            "give a target in photons per pixel, as in --ppp 3.25"
+        )
+    if lux is not None and pixel_pitch is None:
+        one = photons_per_lux_of(EXAMPLE_PITCH**2, clip.exposure)
+        raise ValueError(
+            f"{clip.name}: its radiance is relative (imported video) and has no pixel size, which lux need; give "
+            f"--pixel-pitch, as in --pixel-pitch {EXAMPLE_PITCH:g}, where 1 lx at 555 nm is {one:.3g} PPP in "
+            f"{1e3 * clip.exposure:.4g} ms; or --ppp"
+        )
+    per_lux = None
+    if pixel_pitch is not None:
+        per_lux = photons_per_lux_of(checked_pitch(pixel_pitch, f"{clip.name}: --pixel-pitch") ** 2, clip.exposure)
+        if lux is not None:
+            ppp = lux * per_lux
+    assert ppp is not None
+    factor = ppp_factor(clip.mean_radiance, ppp, clip.name)
+    return LightLevel(factor, _checked(clip, ppp), clip.mean_radiance, None if per_lux is None else ppp / per_lux)
 
 
 def _checked(clip: ClipFolder, ppp: float) -> float:

@@ -56,6 +56,7 @@ class Sensing:
     exposures: tuple[float, ...] | None = None  # shares of a code's time, in turn; None: all of it
     follow: bool = False  # counting SPAD: draw photon by photon, even where the closed form is exact
     temperature: float | None = None  # degrees C of a sensor file with dark_doubling; None: that of the file
+    pixel_pitch: float | None = None  # m, of a clip without a camera: lux need it
 
     def __post_init__(self) -> None:
         """Replace numbers of NumPy, which JSON cannot hold, by those of Python."""
@@ -144,7 +145,8 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
     if sensing.rows is not None:
         _check_rows(sensing, clip, 1 if sensing.group else planes)
-    level = light_level(clip, ppp=None if sensing.ppp is None else sensing.ppp / planes, lux=sensing.lux)
+    ppp = None if sensing.ppp is None else sensing.ppp / planes
+    level = light_level(clip, ppp=ppp, lux=sensing.lux, pixel_pitch=sensing.pixel_pitch)
     conditions = Conditions(sensing.temperature, _wavelength(clip), None if found is None else found.pattern.dark)
     sensor = own or devices.load(
         sensing.sensor,
@@ -278,6 +280,7 @@ def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
         | ({} if draw.shares is None else {"exposures": list(draw.shares)})
         | ({} if draw.origin == (0, 0) else {"origin": list(draw.origin)})
         | _temperature(sensing)
+        | ({} if sensing.pixel_pitch is None else {"pixel_pitch": sensing.pixel_pitch})
     )
 
 

@@ -315,7 +315,15 @@ def stored(stream: Stream) -> Draw:
     return dataclasses.replace(draw, rows=stream.rows, shares=stream.shares, origin=stream.origin)
 
 
-OPTIONAL = ("defects", "rows", "colour", "exposures", "origin", "temperature")  # keys that are left out where off
+OPTIONAL = (
+    "defects",
+    "rows",
+    "colour",
+    "exposures",
+    "origin",
+    "temperature",
+    "pixel_pitch",
+)  # keys that are left out where off
 
 
 def same_settings(old: dict[str, Any], new: dict[str, Any]) -> bool:

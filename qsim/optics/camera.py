@@ -25,6 +25,13 @@ class Pose(Protocol):
         """Return the world velocity of the body's origin [m/s] and angular velocity [rad/s], float64 [3] each."""
 
 
+def checked_pitch(pitch: float, where: str) -> float:
+    """Return a pixel pitch [m]; `ValueError` that names its place for one that no sensor has."""
+    if not 0 < pitch < 1e-3:
+        raise ValueError(f"{where} is in metres, got {pitch!r}; a 1.1 um pixel is 1.1e-6")
+    return pitch
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """Lens, pixels, position and orientation of the camera."""
@@ -47,8 +54,7 @@ class Camera:
     lens: Lens | None = field(default=None, metadata={"described": "if any"})  # distortion, fall-off; None: ideal
 
     def __post_init__(self) -> None:
-        if not 0 < self.pixel_pitch < 1e-3:
-            raise ValueError(f"Camera.pixel_pitch is in metres, got {self.pixel_pitch!r}; a 1.1 um pixel is 1.1e-6")
+        checked_pitch(self.pixel_pitch, "Camera.pixel_pitch")
         if not 0 < self.focal_length < 3:
             raise ValueError(f"Camera.focal_length is in metres, got {self.focal_length!r}; 8 mm is 8e-3")
         if not 100e-9 <= self.wavelength <= 20e-6:

@@ -167,7 +167,12 @@ def illumination(
 
 def photons_per_lux(camera: Camera, exposure: float) -> float:
     """Return photons per pixel in `exposure` [s] for one lux of 555 nm on the faceplate: 2.47 for 1.1 um and 0.5 ms."""
-    return camera.pixel_area * exposure / (LUMINOUS_EFFICACY * photon_energy(LUX_WAVELENGTH))
+    return photons_per_lux_of(camera.pixel_area, exposure)
+
+
+def photons_per_lux_of(area: float, exposure: float) -> float:
+    """Return the same for a photosensitive area [m^2] without a camera."""
+    return area * exposure / (LUMINOUS_EFFICACY * photon_energy(LUX_WAVELENGTH))
 
 
 def photopic(bands: Sequence[float]) -> float:

@@ -76,6 +76,8 @@ class Noise(Illumination):
         ppp, lux = meta.get("ppp_target"), meta.get("lux_target")
         if "ppp_target" not in meta:  # written by another program
             ppp = meta.get("ppp")
+        if lux is not None and "pixel_pitch" in meta:  # of a clip without a camera: these lux are so many photons
+            ppp, lux = meta["ppp"], None
         defects = meta.get("defects")
         return cls(
             name,

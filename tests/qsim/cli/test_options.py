@@ -158,6 +158,12 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Acts("sense clip --name n", "--lux 0.3"),
         Refused("sense clip --ppp 1", "--lux 9", "not both"),
     ],
+    ("sense", "--pixel-pitch"): [
+        Acts("sense relative --lux 1 --name n", "--pixel-pitch 1.1e-6", codes=(0, 2)),
+        Refused("sense clip --lux 1", "--pixel-pitch 2e-6", "its camera has pixels of"),
+        Refused("sense relative --lux 1", "--pixel-pitch 1.1", "--pixel-pitch is in metres, got 1.1"),
+        Refused("sense clip --replay clip:1", "--pixel-pitch 1e-6", "draws what is stored"),
+    ],
     ("sense", "--seed"): [Acts("sense clip --name n", "--seed 4")],
     ("sense", "--name"): [Acts("sense clip", "--name other", names)],
     ("sense", "--group"): [

@@ -8,7 +8,7 @@ from tiny_clip import FRAMES, write
 
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.photons import clip_photons, light_level, light_line
-from qsim.clip.sensing import Sensing, sense
+from qsim.clip.sensing import Sensing, replay, sense
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 
@@ -52,6 +52,38 @@ def test_relative_radiance_needs_a_target(tmp_path: Path):
     level = light_level(clip, ppp=3.25)
     mean = np.mean([clip_photons(clip, t, level.factor).mean() for t in range(FRAMES)])
     assert mean == pytest.approx(3.25, rel=1e-12)
+
+
+def test_lux_of_a_clip_without_a_camera_need_a_pixel_pitch(tmp_path: Path):
+    """1 lx at 555 nm on 1.1 um for 4.167 ms: (1/683) W/m2 * 1.21e-12 m2 * 4.167e-3 s / 3.5792e-19 J = 20.6 photons."""
+    clip = write(tmp_path / "r", radiance_unit=RELATIVE, camera=None, exposure=1 / 240, frame_rate=240.0)
+    with pytest.raises(
+        ValueError, match=r"as in --pixel-pitch 1.1e-06, where 1 lx at 555 nm is 20\.6 PPP in 4\.167 ms"
+    ):
+        light_level(clip, lux=3.0)
+    level = light_level(clip, lux=3.0, pixel_pitch=1.1e-6)
+    assert level.ppp == pytest.approx(3 * 20.62, rel=1e-3)
+    assert level.lux == pytest.approx(3.0)
+    assert light_level(clip, ppp=level.ppp, pixel_pitch=2.2e-6).lux == pytest.approx(0.75)
+    with pytest.raises(ValueError, match="no absolute light"):
+        light_level(clip, pixel_pitch=1.1e-6)
+
+
+def test_lux_of_a_video_are_those_of_a_camera_with_its_pixels(tmp_path: Path):
+    """One pitch and exposure, photosensitive all over: the same photons with and without a lens, also in sums."""
+    camera = write(tmp_path / "a")
+    assert camera.camera.fill_factor == 1
+    pitch = camera.camera.pixel_pitch
+    video = write(tmp_path / "r", radiance_unit=RELATIVE, camera=None)
+    wanted = light_level(camera, lux=2.0).ppp
+    assert light_level(video, lux=2.0, pixel_pitch=pitch).ppp == pytest.approx(wanted)
+    stream, line = sense(video, Sensing(BinarySPAD(0.5, 0.0, 2), lux=2.0, pixel_pitch=pitch, group=True))
+    assert stream.meta["pixel_pitch"] == pitch
+    assert stream.meta["ppp"] == pytest.approx(3 * wanted)
+    assert "equivalent to 2 lx at 555 nm" in line
+    np.testing.assert_array_equal(*replay(video, stream, 0))
+    with pytest.raises(FileExistsError, match="other settings"):
+        sense(video, Sensing(BinarySPAD(0.5, 0.0, 2), lux=2.0, pixel_pitch=2 * pitch, group=True))
 
 
 @pytest.mark.parametrize(

@@ -220,7 +220,7 @@ def test_clips_that_hold_no_window_are_named(make_clip: ClipMaker):
 @pytest.mark.parametrize(
     ("noise", "message"),
     [
-        (Noise(ppp=None, lux=10.0), "photo: its radiance is relative .* has no lux"),
+        (Noise(ppp=None, lux=10.0), "photo: its radiance is relative .* has no pixel size, which lux need"),
         (Noise(diffraction=True), "photo: diffraction needs a camera, .*; leave its data set out, or sense the other"),
     ],
     ids=["lux", "diffraction"],
