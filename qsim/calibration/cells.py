@@ -11,17 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import ceil, sqrt
+from math import ceil, inf, sqrt
 from statistics import NormalDist
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.calibration.frame_statistics import FrameStatistics
-from qsim.calibration.prnu import OUTLIER, robust_sigma, surface
+from qsim.calibration.prnu import OUTLIER, robust_sigma, smooth_part, surface
 
 MOST_GROUPS = 10
 LEAST_PIXELS = 24  # of a group
+MOST_SUMS = 1 << 20  # values of a sum of codes, whose law is computed exactly
 WIDTH = 1.2  # most difference of light within a group, in standard deviations of one code
 
 
@@ -78,7 +79,7 @@ def _smooth_light(flats: Sequence[FrameStatistics], good: Array) -> Array:
     level = np.sum([flat.total / flat.frames for flat in flats], axis=0)
     height, width = good.shape
     basis = surface((height, width), int(good.sum()))
-    return np.asarray(basis @ np.linalg.lstsq(basis[good.ravel()], level[good], rcond=None)[0]).reshape(good.shape)
+    return smooth_part(basis, level.ravel(), good.ravel()).reshape(good.shape)
 
 
 def _groups(darks: Sequence[Array], flats: Sequence[Array], light: Array) -> list[Array]:
@@ -105,8 +106,7 @@ def good_pixels(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistic
         basis = surface((good.shape[0], good.shape[1]), int(good.sum()))
         inside = good.ravel().copy()
         for _ in range(3):
-            fitted = basis @ np.linalg.lstsq(basis[inside], level[inside], rcond=None)[0]
-            residual = level - fitted
+            residual = level - smooth_part(basis, level, inside)
             spread = max(robust_sigma(residual[inside]), sqrt(np.median(flat.pixel_variance) / flat.frames), 1e-9)
             inside = good.ravel() & (np.abs(residual) <= OUTLIER * spread)
         good &= inside.reshape(good.shape)
@@ -114,21 +114,41 @@ def good_pixels(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistic
 
 
 def _hot(stack: FrameStatistics) -> Array:
-    """Return the pixels whose dark mean exceeds that of the others by more than their noise explains.
+    """Return the pixels [H, W] whose sum of dark codes exceeds what frames of the other pixels give.
 
-    The limit is passed by a fifth of a good pixel, all together. It allows for the skewness of few electrons.
+    The limit is passed by a fifth of a good pixel, all together. The law of the sum is that of independent codes from
+    the histogram of the pixels that stay, so it is right for rare electrons too.
     """
-    level = stack.total / stack.frames
-    in_time = stack.pixel_variance
-    z = NormalDist().inv_cdf(1 - 0.2 / max(level.size, 5))
-    good = level <= np.quantile(level, 0.9)
+    codes = _codes(stack)
+    total = stack.total
+    sampled = total[:: stack.stride, :: stack.stride].ravel()
+    chance = 0.2 / max(total.size, 5)
+    good = np.ones_like(total, dtype=bool)
+    limit = inf
     for _ in range(30):
-        centre = float(level[good].mean())
-        spread = sqrt(max(float(in_time[good].mean()) / stack.frames, float(level[good].var()), 1e-12))
-        third = float(((level[good] - centre) ** 3).mean()) / spread**3
-        limit = centre + spread * (z + min(max(third, 0.0), 1.5) * (z * z - 1) / 6)
-        now = level <= limit
+        kept = codes[:, sampled <= limit]
+        limit = sum_limit(np.bincount(kept.ravel()), stack.frames, chance)
+        now = total <= limit
         if np.array_equal(now, good):
             break
         good = now
     return ~good
+
+
+def sum_limit(histogram: Array, terms: int, chance: float) -> float:
+    """Return the sum of so many independent codes of a histogram that is exceeded with a probability `chance`."""
+    low, high = np.flatnonzero(histogram)[[0, -1]]
+    share = histogram[low : high + 1] / histogram.sum()
+    length = (len(share) - 1) * terms + 1
+    codes = np.arange(len(share))
+    centre = float(share @ codes)
+    variance = float(share @ (codes - centre) ** 2)
+    if length <= MOST_SUMS:
+        size = 1 << (length - 1).bit_length()
+        law = np.fft.irfft(np.fft.rfft(share, size) ** terms, size)[:length]
+        above = np.cumsum(law[::-1])[::-1] - law
+        return float(low * terms + np.argmax(above < chance))
+    # so many terms are normal but for their skewness (Cornish and Fisher, 1938)
+    z = NormalDist().inv_cdf(1 - chance)
+    skew = float(share @ (codes - centre) ** 3) / max(variance, 1e-12) ** 1.5 / sqrt(terms)
+    return terms * (low + centre) + sqrt(terms * variance) * (z + skew * (z * z - 1) / 6)

@@ -72,7 +72,7 @@ def _summed(at: Array, noise: float, mean: Array, spread: Array) -> tuple[Array,
     electrons = np.arange(max(floor(float((mean - wide).min())), 0), ceil(float((mean + wide).max())) + 1, dtype=float)
     weights, by_mean, by_spread = _electrons(electrons, noise, mean, spread)
     window = ceil(2 * REACH * noise) + 2
-    if len(electrons) <= 2 * window + 100:
+    if len(electrons) <= 2 * window:
         z = (at - electrons[:, None]) / noise
         phi, density = ndtr(z), np.exp(-0.5 * z * z) / (sqrt(2 * pi) * noise)
         return weights @ phi, weights @ density, -(weights @ (z * density)), by_mean @ phi, by_spread @ phi

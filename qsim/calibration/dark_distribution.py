@@ -21,6 +21,7 @@ from math import inf, log, sqrt
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.calibration.quantiles import binomial_quantile
 from qsim.calibration.results import Value
 
 PERCENTILES = (1, 10, 25, 75, 90, 99, 99.9)  # in addition to the median
@@ -90,13 +91,11 @@ def _rate(value: float, low: float, high: float, counts: Counts, method: str) ->
 
 def _order_statistic(ordered: Array, percent: float, counts: Counts) -> tuple[float, float, float]:
     """Return a percentile of the totals and its exact 95 % interval; the interval is infinite if too few are beyond."""
-    from scipy.stats import binom
-
     n = ordered.size
     share = percent / 100
     value = float(np.percentile(ordered, percent))
-    first = int(binom.ppf(0.025, n, share)) - 1
-    last = int(binom.ppf(0.975, n, share))
+    first = binomial_quantile(0.025, n, share) - 1
+    last = binomial_quantile(0.975, n, share)
     low = float(ordered[first]) if first >= 0 else 0.0
     high = float(ordered[last]) if last < n else inf
     saturated = 0 if counts.saturated is None else int(counts.saturated.sum())

@@ -18,6 +18,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.calibration.frame_statistics import FrameStatistics, alike, as_codes, measure
+from qsim.calibration.quantiles import chi2_above
 from qsim.calibration.results import Z95, Calibration, Value, normal_interval
 from qsim.calibration.spad_response import Response
 
@@ -248,7 +249,5 @@ def calibrate_static(
 
 def _p_value(residuals: Array, fitted: int) -> float:
     """Return the chi-square p-value of the classes' variances against the curve; a dead time of 0 is not fitted."""
-    from scipy.stats import chi2
-
     freedom = len(residuals) - fitted
-    return float(chi2.sf(float((residuals**2).sum()), freedom)) if freedom > 0 else float("nan")
+    return chi2_above(float((residuals**2).sum()), freedom) if freedom > 0 else float("nan")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.calibration.frame_statistics import FrameStatistics
-from qsim.calibration.prnu import WIDEST, Flat, hot_by_level, surface
+from qsim.calibration.prnu import WIDEST, Flat, hot_by_level, smooth_part, surface
 from qsim.calibration.spad_response import Response
 from qsim.sensor.qis import QIS
 
@@ -157,7 +157,7 @@ def _electrons(sensor: QIS, shift: float, light: Array) -> Array:
 def _table(mean: Array, good: Array, curve: Callable[[Array], Array], largest: float) -> tuple[Array, Array]:
     """Return (light, mean code) [G] up to `WIDEST` times the brightest light of the flat's smooth surface."""
     basis = surface(mean.shape, int(good.sum()))
-    fitted = basis @ np.linalg.lstsq(basis[good.ravel()], mean[good], rcond=None)[0]
+    fitted = smooth_part(basis, mean.ravel(), good.ravel())
     light = np.linspace(0, np.sqrt(max(largest, 1e-9)), 600) ** 2
     codes = curve(light)
     rising = int(np.argmax(codes)) + 1

@@ -9,6 +9,7 @@ from numpy import ndarray as Array
 
 from qsim.calibration.frame_statistics import FrameStatistics
 from qsim.calibration.prnu import normal_nodes
+from qsim.calibration.quantiles import chi2_above
 
 NODES, WEIGHTS = normal_nodes(5)  # of a PRNU
 
@@ -27,20 +28,17 @@ def goodness(
     return chi_square(pairs, fitted), tuple(residuals)
 
 
-def chi_square(histograms: Iterable[tuple[Array, Array]], fitted: int) -> float:
+def chi_square(histograms: Iterable[tuple[Array, Array]], fitted: int, total: float = 0.0, freedom: int = 0) -> float:
     """Return the p-value of (observed, expected) histograms with so many `fitted` parameters; NaN without freedom.
 
-    Bins with an expectation below 5 are pooled.
+    Bins with an expectation below 5 are pooled. `total` is a chi-square of `freedom` other numbers, which is added.
     """
-    from scipy.stats import chi2
-
-    total = 0.0
-    freedom = -fitted
+    freedom -= fitted
     for observed, expected in histograms:
         observed_bins, expected_bins = pooled(observed, expected)
         total += float(np.sum((observed_bins - expected_bins) ** 2 / expected_bins))
         freedom += len(expected_bins) - 1
-    return float(chi2.sf(total, freedom)) if freedom > 0 else float("nan")
+    return chi2_above(total, freedom) if freedom > 0 else float("nan")
 
 
 def pooled(observed: Array, expected: Array, least: float = 5.0) -> tuple[Array, Array]:

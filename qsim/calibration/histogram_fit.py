@@ -1,5 +1,8 @@
 """Fits the histograms of a camera's dark and flat frames by maximum likelihood.
 
+Of bright cells mean and variance are fitted (moment_law.py), of the others the histogram (code_law.py): by a sum over
+electrons, or by an Edgeworth series if a cell is both bright and clipped.
+
 Parameters: ln gain [codes/e-], offset [codes], ln read noise [e-], dark electrons of the longest exposure, and the
 expected electrons of every cell of a flat. Time enters through ratios of exposures only. The covariance is the sandwich
 I^-1 J I^-1 (White, Econometrica 50, 1982); J is summed over pixels, whose codes share light and excess.
@@ -16,18 +19,15 @@ from numpy import ndarray as Array
 
 from qsim.calibration.cells import Cell
 from qsim.calibration.code_law import Law, code_law
-from qsim.calibration.goodness import NODES, WEIGHTS, goodness  # noqa: F401  (spad.py takes them from here)
-from qsim.calibration.starts import distinct, starts_of
+from qsim.calibration.moment_law import BRIGHT, MomentLaw, by_moments
+from qsim.calibration.starts import distinct, first_gain, starts_of
 
 GAIN, OFFSET, NOISE, DARK = range(4)
 SHARED = 4  # parameters before those of the cells
-BRIGHT = 150.0  # e-; above, an Edgeworth series replaces the sum over electrons, if read noise hides the electrons
-HIDDEN = 0.8  # e- of read noise that hides the electrons
-FINEST = 3.0  # bins in one standard deviation of the read noise
-MOST_BINS = 1200
-STARTS = 4  # that are followed
-FEW_BITS = 6  # up to here a fit is quick, and has more local maxima
-MORE_STARTS = 10
+FINEST = 2.0  # bins in one standard deviation of the read noise
+MOST_BINS = 800
+STARTS = 10  # that are followed
+APART = 0.4  # e- of the brightest cell of which the histogram is used; starts differ by more
 LEAST_NOISE = 0.05  # codes; less read noise changes no histogram
 
 
@@ -57,9 +57,7 @@ class State:
 class Likelihood:
     """The likelihood of all cells, as a function of the parameters."""
 
-    def __init__(
-        self, cells: Sequence[Cell], exposures: Sequence[float], darks: int, bits: int, start: Array, *, hidden: bool
-    ) -> None:
+    def __init__(self, cells: Sequence[Cell], exposures: Sequence[float], darks: int, bits: int, start: Array) -> None:
         self.cells, self.bits, self.darks = tuple(cells), bits, darks
         longest = max(exposures[:darks])
         self.share = np.array([exposures[c.stack] / longest if c.stack < darks else 0.0 for c in cells])
@@ -68,23 +66,25 @@ class Likelihood:
         self.response = np.ones(len(cells))  # d mean code / d light, relative to the gain
         self.own = np.where(self.dark, -1, SHARED - 1 + np.cumsum(~self.dark))
         self.size = SHARED + int(np.count_nonzero(~self.dark))
-        self.panels = tuple(self._panels(start, hidden))
+        gain = first_gain(cells)
+        self.simple = np.array([i for i, cell in enumerate(cells) if by_moments(cell, gain, bits)], dtype=int)
+        self.moments = MomentLaw([cells[i] for i in self.simple])
+        self.panels = tuple(self._panels(start))
 
-    def _panels(self, start: Array, hidden: bool) -> list[Panel]:
-        """Return one panel of all dim cells, and those of the bright ones: one per stack if no electron shows."""
-        gain, noise = exp(start[GAIN]), exp(start[NOISE])
+    def _panels(self, start: Array) -> list[Panel]:
+        """Return one panel of all dim cells, and those of the bright ones: one per stack."""
+        step = exp(start[GAIN] + start[NOISE]) / FINEST
         electrons = self.means(start)
-        dim = [i for i, mean in enumerate(electrons) if mean <= BRIGHT]
-        together: dict[tuple[int, int], list[int]] = {}
-        for i, cell in enumerate(self.cells):
-            if i not in dim:  # with an exact sum every bright cell has bins of its own, because its range is short
-                together.setdefault((cell.stack, 0 if hidden else i), []).append(i)
-        panels = [self._panel(dim, gain * noise / FINEST, smooth=False)] if dim else []
+        rest = [i for i in range(len(self.cells)) if i not in self.simple]
+        dim = [i for i in rest if electrons[i] <= BRIGHT]
+        together: dict[int, list[int]] = {}
+        for i in rest:
+            if i not in dim:
+                together.setdefault(self.cells[i].stack, []).append(i)
+        panels = [self._panel(dim, step, smooth=False)] if dim else []
         for members in together.values():
-            step = gain * noise / FINEST
-            if hidden:
-                step = sqrt(min(self.cells[i].variance for i in members)) / 5
-            panels.append(self._panel(members, step, smooth=hidden))
+            step = sqrt(min(self.cells[i].variance for i in members)) / 5
+            panels.append(self._panel(members, step, smooth=True))
         return panels
 
     def _panel(self, members: list[int], step: float, *, smooth: bool) -> Panel:
@@ -128,12 +128,32 @@ class Likelihood:
             for panel in self.panels
         )
 
+    def brightest(self, parameters: Array) -> float:
+        """Return the most electrons of a cell of which the histogram is used."""
+        electrons = self.means(parameters)
+        return max((float(electrons[list(panel.cells)].max()) for panel in self.panels), default=0.0)
+
     def value(self, parameters: Array) -> float:
         """Return the log likelihood."""
-        return sum(
+        shapes = sum(
             float(np.sum(panel.counts * np.log(law.shares)))
             for panel, law in zip(self.panels, self.laws(parameters), strict=True)
         )
+        return shapes + self.moments.value(*self.moments_at(parameters))
+
+    def moments_at(self, parameters: Array) -> tuple[Array, Array]:
+        """Return mean and variance of the cells of which nothing else is used."""
+        gain, offset, noise = exp(parameters[GAIN]), float(parameters[OFFSET]), exp(parameters[NOISE])
+        return self.moments.laws(gain, offset, noise, self.means(parameters)[self.simple])
+
+    def moment_slopes(self, parameters: Array) -> tuple[Array, Array]:
+        """Return the derivatives of both by ln gain, offset, ln read noise, dark and own electrons: [5, cells]."""
+        electrons = self.means(parameters)[self.simple]
+        share, own = self.share[self.simple], ~self.dark[self.simple]
+        of_mean, of_variance = self.moments.slopes(exp(parameters[GAIN]), exp(parameters[NOISE]), electrons)
+        parts = np.stack([np.ones_like(share), np.ones_like(share), np.ones_like(share), share, own])
+        rows = [0, 1, 2, 3, 3]
+        return of_mean[rows] * parts, of_variance[rows] * parts
 
     def slopes(self, panel: Panel, law: Law, parameters: Array, excess: Array | None = None) -> Array:
         """Return dP by ln gain, offset, ln read noise, dark electrons and the cell's own mean: [5, cells, B]."""
@@ -148,22 +168,33 @@ class Likelihood:
         """Return value, score and information at some parameters."""
         laws = self.laws(parameters)
         value, score, information = 0.0, np.zeros(self.size), np.zeros((self.size, self.size))
-        for panel, law in zip(self.panels, laws, strict=True):
-            members = list(panel.cells)
-            slope = self.slopes(panel, law, parameters)
-            value += float(np.sum(panel.counts * np.log(law.shares)))
-            pushes = np.einsum("qrb,rb->qr", slope, panel.counts / law.shares)
-            weight = panel.counts.sum(axis=1)[:, None] / law.shares
-            fisher = np.einsum("qrb,rb,prb->qpr", slope, weight, slope, optimize=True)
+
+        def add(members: Array, pushes: Array, fisher: Array) -> None:
+            """Add the score [5, cells] and the information [5, 5, cells] of cells."""
             score[:SHARED] += pushes[:SHARED].sum(axis=1)
             information[:SHARED, :SHARED] += fisher[:SHARED, :SHARED].sum(axis=2)
-            for r, i in enumerate(members):
-                k = self.own[i]
-                if k >= 0:
-                    score[k] += pushes[SHARED, r]
-                    information[k, k] += fisher[SHARED, SHARED, r]
-                    information[:SHARED, k] += fisher[:SHARED, SHARED, r]
-                    information[k, :SHARED] += fisher[:SHARED, SHARED, r]
+            flat = self.own[members] >= 0
+            k = self.own[members][flat]  # every cell of a flat has a parameter, so no k is there twice
+            score[k] += pushes[SHARED, flat]
+            information[k, k] += fisher[SHARED, SHARED, flat]
+            information[:SHARED, k] += fisher[:SHARED, SHARED, flat]
+            information[k, :SHARED] += fisher[:SHARED, SHARED, flat].T
+
+        for panel, law in zip(self.panels, laws, strict=True):
+            slope = self.slopes(panel, law, parameters)
+            value += float(np.sum(panel.counts * np.log(law.shares)))
+            weight = panel.counts.sum(axis=1)[:, None] / law.shares
+            fisher = np.einsum("qrb,prb->qpr", slope * weight, slope, optimize=True)
+            add(np.array(panel.cells), np.einsum("qrb,rb->qr", slope, panel.counts / law.shares), fisher)
+        if self.simple.size:
+            mean, variance = self.moments_at(parameters)
+            slopes = self.moment_slopes(parameters)
+            value += self.moments.value(mean, variance)
+            add(
+                self.simple,
+                self.moments.score(mean, variance, *slopes),
+                self.moments.information(variance, *slopes),
+            )
         return State(parameters, value, score, information, laws)
 
     def bounds(self, parameters: Array) -> Array:
@@ -239,6 +270,14 @@ class Likelihood:
                     terms += by_excess[:, r, None] * (cell.influence / cell.influence.size)
                     pushes[cell.pixels, self.own[i]] += terms[SHARED]
                 pushes[cell.pixels, :SHARED] += terms[:SHARED].T
+        if self.simple.size:
+            laws, steepness = self.moments_at(state.parameters), self.moment_slopes(state.parameters)
+            for r, i in enumerate(self.simple):
+                cell = self.cells[i]
+                terms = self.moments.pushes(r, *laws, *steepness)
+                pushes[cell.pixels, :SHARED] += terms[:SHARED].T
+                if not self.dark[i]:
+                    pushes[cell.pixels, self.own[i]] += terms[SHARED]
         scale = 1 / np.sqrt(np.maximum(np.diag(state.information), 1e-300))
         matrix = state.information * np.outer(scale, scale)
         inverse = np.linalg.pinv(matrix, rcond=1e-12, hermitian=True) * np.outer(scale, scale)
@@ -287,15 +326,14 @@ def fit_cells(cells: Sequence[Cell], exposures: Sequence[float], darks: int, bit
     starts = starts_of(cells, share, darks)
     first = starts.points[0].copy()
     first[NOISE] = log(starts.noise)
-    likelihood = Likelihood(cells, exposures, darks, bits, first, hidden=starts.hidden)
+    likelihood = Likelihood(cells, exposures, darks, bits, first)
     values = [likelihood.value(likelihood.inside(point)) for point in starts.points]
-    count = STARTS if bits > FEW_BITS else MORE_STARTS
-    rough = [likelihood.maximise(point, rounds=12, enough=0.1) for point in distinct(starts.points, values, count)]
+    chosen = distinct(starts.points, values, STARTS, APART / max(likelihood.brightest(first), 1.0))
+    rough = [likelihood.maximise(point, rounds=12, enough=0.1) for point in chosen]
     best = max(rough, key=lambda state: state.value)
     likelihood.set_response(best)
     best = likelihood.maximise(best.parameters)
-    hidden = starts.hidden and exp(best.parameters[NOISE]) > HIDDEN
-    likelihood = Likelihood(cells, exposures, darks, bits, best.parameters, hidden=hidden)
+    likelihood = Likelihood(cells, exposures, darks, bits, best.parameters)
     return refined(likelihood, best)
 
 

@@ -16,11 +16,10 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.calibration.cells import Cell
+from qsim.calibration.moment_law import ADC, CLIPPED
 from qsim.calibration.results import Value, normal_interval, root_interval
 
 LEAST_NOISE = 0.7  # codes; 1/12 is then right to 6e-5 codes^2
-CLIPPED = 1e-4  # most share of codes at either end of the scale
-ADC = 1 / 12  # codes^2
 METHOD = "mean-variance"
 
 

@@ -20,6 +20,7 @@ from math import inf, isfinite, sqrt
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.calibration.quantiles import chi2_quantile
 from qsim.calibration.results import Value
 
 HOT = 10.0  # times the median dark rate
@@ -105,6 +106,13 @@ def surface(shape: tuple[int, int], pixels: int) -> Array:
     return np.stack([term.ravel() for term in terms], axis=1)
 
 
+def smooth_part(basis: Array, values: Array, used: Array) -> Array:
+    """Return the surface [n] of `basis` [n, terms] that is nearest to the values [n] that are `used` [n]."""
+    some = basis[used]
+    # the polynomials are nearly orthogonal, so the normal equations are as good as a decomposition and much quicker
+    return np.asarray(basis @ np.linalg.lstsq(some.T @ some, some.T @ values[used], rcond=1e-12)[0])
+
+
 def outliers(flat: Flat) -> Array:
     """Return the pixels of a flat [H, W] above its smooth surface by 6 robust sigmas: hot ones, without dark frames."""
     values = flat.mean.ravel()
@@ -113,7 +121,7 @@ def outliers(flat: Flat) -> Array:
     for _ in range(20):
         if good.sum() <= 2 * basis.shape[1]:
             return np.zeros(flat.mean.shape, bool)
-        fitted = basis @ np.linalg.lstsq(basis[good], values[good], rcond=None)[0]
+        fitted = smooth_part(basis, values, good)
         residual = (values - fitted) / np.maximum(fitted - flat.codes[0], 1e-12)
         now = residual <= np.median(residual) + OUTLIER * robust_sigma(residual)
         if np.array_equal(now, good):
@@ -153,7 +161,7 @@ def measure_pattern(flats: Sequence[Flat], hot: Array, rule: str = BY_DARK) -> P
 def _of_all(flat: Flat, good: Array) -> Value:
     """Return the spread of all pixels about the smooth surface of the good ones, relative to their light."""
     basis = surface(flat.raw.shape, int(good.sum()))
-    fitted = basis @ np.linalg.lstsq(basis[good.ravel()], flat.raw[good], rcond=None)[0]
+    fitted = smooth_part(basis, flat.raw.ravel(), good.ravel())
     residual = flat.raw.ravel() - fitted
     square, noise = float(residual.var(ddof=basis.shape[1])), float(flat.noise.mean())
     of_square = float(np.var((residual - residual.mean()) ** 2)) / residual.size
@@ -198,15 +206,13 @@ def _of_good(flat: Flat, good: Array) -> tuple[Value, float]:
 
 def difference_interval(first: float, of_first: float, second: float, of_second: float) -> tuple[float, float]:
     """Return the 95 % interval of a difference of two variance estimates; `of_...` are their variances."""
-    from scipy.stats import chi2
 
     def reach(value: float, variance: float) -> tuple[float, float]:
         """Return how far the true value may lie below and above by chi-square, relative."""
         if variance <= 0 or value <= 0:
             return 0.0, 0.0
         freedom = max(2 * value**2 / variance, 1.0)
-        below, above = chi2.ppf((0.975, 0.025), freedom)
-        return 1 - freedom / float(below), freedom / float(above) - 1
+        return 1 - freedom / chi2_quantile(0.975, freedom), freedom / chi2_quantile(0.025, freedom) - 1
 
     (down, up), (down_noise, up_noise) = reach(first, of_first), reach(second, of_second)
     low = first - second - sqrt((down * first) ** 2 + (up_noise * second) ** 2)

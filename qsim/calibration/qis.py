@@ -25,6 +25,7 @@ from qsim.calibration.intervals import HigherMaximum, profile
 from qsim.calibration.photon_transfer import LEAST_NOISE as LEAST_TRANSFER_NOISE
 from qsim.calibration.photon_transfer import photon_transfer
 from qsim.calibration.prnu import measure_pattern
+from qsim.calibration.quantiles import student_quantile
 from qsim.calibration.results import Z95, Calibration, Value, odd_efficiency
 from qsim.sensor.qis import QIS
 
@@ -148,8 +149,6 @@ def _efficiency(fit: Fit, flats: Sequence[FrameStatistics], exposures: Sequence[
     The light of several flats differs from what is stated, by drift. Their scatter is measured and enters the interval
     by Student's t (Hartung and Knapp, Statistics in Medicine 20, 2001).
     """
-    from scipy.stats import t
-
     known = [i for i, flat in enumerate(flats) if flat.photons]
     if not known:
         return {}
@@ -180,7 +179,7 @@ def _efficiency(fit: Fit, flats: Sequence[FrameStatistics], exposures: Sequence[
         freedom = len(known) - 1
         inner = float(weights**2 @ own)
         scatter = float(weights @ (found - value) ** 2) / freedom
-        reach = float(t.ppf(0.975, freedom)) ** 2 * scatter - Z95**2 * inner
+        reach = student_quantile(0.975, freedom) ** 2 * scatter - Z95**2 * inner
         low = value - sqrt(max((value - low) ** 2 + reach, 0.0))
         high = value + sqrt(max((high - value) ** 2 + reach, 0.0))
         method = f"light standard, with the scatter of {len(known)} flats"
@@ -230,7 +229,13 @@ def _goodness(fit: Fit, stacks: int, bits: int) -> tuple[float, tuple[Array, ...
             np.add.at(observed[fit.likelihood.cells[i].stack], codes, panel.counts[r])
             np.add.at(expected[fit.likelihood.cells[i].stack], codes, fitted)
     residuals = (observed - expected) / np.sqrt(np.maximum(expected, 1.0))
-    return chi_square(histograms, fit.likelihood.size), tuple(residuals)
+    simple = fit.likelihood.simple
+    own = int(np.count_nonzero(~fit.likelihood.dark[simple]))  # parameters that the mean of a cell determines
+    misfit, freedom = 0.0, 0
+    if simple.size:
+        misfit = fit.likelihood.moments.misfit(fit.likelihood.moments_at(fit.state.parameters)[1])
+        freedom = simple.size
+    return chi_square(histograms, fit.likelihood.size - own, misfit, freedom), tuple(residuals)
 
 
 def _advice(

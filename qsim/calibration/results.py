@@ -9,6 +9,8 @@ from statistics import NormalDist
 
 from numpy import ndarray as Array
 
+from qsim.calibration.quantiles import chi2_quantile
+
 Z95 = NormalDist().inv_cdf(0.975)  # two-sided 95 % of the normal distribution
 
 
@@ -55,9 +57,8 @@ def normal_interval(value: float, variance: float, unit: str, method: str, *, fl
 
 def poisson_interval(value: float, count: float, unit: str, method: str) -> Value:
     """Return the exact interval of a value that is proportional to a Poisson count of at least 1."""
-    from scipy.stats import chi2
-
-    low, high = float(chi2.ppf(0.025, 2 * count)) / 2, float(chi2.ppf(0.975, 2 * count + 2)) / 2
+    low = chi2_quantile(0.025, 2 * count) / 2
+    high = chi2_quantile(0.975, 2 * count + 2) / 2
     return Value(value, value * low / count, value * high / count, unit, method)
 
 

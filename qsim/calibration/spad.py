@@ -24,8 +24,9 @@ from qsim.calibration.dark_distribution import Counts, Distribution, distributio
 from qsim.calibration.dead_time import Pooled, Ratio, fitted_dead_time, matched_variance, moved_ratio
 from qsim.calibration.flat_fields import DarkRates, dark_rates, light_of, most_counts, spad_flats, too_bright
 from qsim.calibration.frame_statistics import FrameStatistics, check_noise, check_stacks
-from qsim.calibration.histogram_fit import NODES, WEIGHTS, goodness
-from qsim.calibration.prnu import BY_DARK, BY_FLAT, Flat, hot_by_rate, measure_pattern, outliers, surface
+from qsim.calibration.goodness import NODES, WEIGHTS, goodness
+from qsim.calibration.prnu import BY_DARK, BY_FLAT, Flat, hot_by_rate, measure_pattern, outliers, smooth_part, surface
+from qsim.calibration.quantiles import chi2_quantile
 from qsim.calibration.results import Z95, Calibration, Value, odd_efficiency, poisson_interval
 from qsim.calibration.spad_response import NEIGHBOURS, Response
 
@@ -286,16 +287,14 @@ def _mean_rate(array: _Array, dark: DarkRates, chosen: Array) -> Value:
 
 def _near_saturation(dark: DarkRates, near: Array, response: Response) -> tuple[float, float]:
     """Return the summed squares of the distances to the ends of each nearly saturated pixel's interval, (1/s)^2."""
-    from scipy.stats import chi2
-
     below, above = 0.0, 0.0
     for missing, frames, exposure, rate in zip(
         dark.missing[near], dark.frames[near], dark.exposure[near], dark.rate[near], strict=True
     ):
         here = response.at(exposure)
         most = most_counts(here)
-        fewest = float(chi2.ppf(0.025, 2 * missing)) / 2 if missing > 0 else 0.0
-        largest = float(chi2.ppf(0.975, 2 * max(missing, 0) + 2)) / 2
+        fewest = chi2_quantile(0.025, 2 * missing) / 2 if missing > 0 else 0.0
+        largest = chi2_quantile(0.975, 2 * max(missing, 0) + 2) / 2
         arrivals, codes = here.table(most)
         low = float(np.interp(most - largest / frames, codes, arrivals)) / exposure
         below += max(rate - low, 0.0) ** 2
@@ -386,7 +385,7 @@ def _mean_light(flat: FrameStatistics, dark: DarkRates | None, good: Array, resp
     if missing == 0:
         return mean, noise
     basis = surface(good.shape, int(good.sum()))
-    fitted = basis @ np.linalg.lstsq(basis[good.ravel()], light[good], rcond=None)[0]
+    fitted = smooth_part(basis, light.ravel(), good.ravel())
     spread = float(np.var(light[good] - fitted[good.ravel()]))
     mean += float(fitted.mean() - fitted[good.ravel()].mean())
     return mean, noise + spread * missing / (good.size * good.sum())

@@ -14,9 +14,11 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.calibration.cells import Cell
+from qsim.calibration.moment_law import ADC
 
 SHIFTS = (1.0, 0.97, 1.03, 0.94, 1.06, 0.9, 1.1, 0.8, 1.2, 0.65, 1.4)  # of the first gain, where no peak shows
-NOISES = (0.1, 0.2, 0.35, 0.6)  # e-
+NOISES = (0.1, 0.2, 0.3, 0.4, 0.6)  # e-
+PARTS = (0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.997)  # of the variance in the dark, by read noise
 COMB = 1.05  # codes/e-; above, the transform may show electrons
 FINE = 2.0  # codes/e-; above, it shows how wide they are
 PADDING = 8  # of the Fourier transform
@@ -48,7 +50,7 @@ def starts_of(cells: Sequence[Cell], share: Array, darks: int) -> Starts:
     dark = [i for i, cell in enumerate(cells) if cell.stack < darks]
     shortest = min(dark, key=lambda i: share[i])
     longest = max(dark, key=lambda i: share[i])
-    variance = max(cells[shortest].variance - 1 / 12, 1e-4)  # codes^2
+    variance = max(cells[shortest].variance - ADC, 1e-4)  # codes^2
     several = share[shortest] < share[longest]
     points: list[Array] = []
 
@@ -73,15 +75,17 @@ def starts_of(cells: Sequence[Cell], share: Array, darks: int) -> Starts:
     for shift in SHIFTS if gain < FINE and not hidden else few:
         at = gain * shift
         total = variance / at**2
+        tried = () if hidden else NOISES if gain < 2 * FINE else (0.35, 0.6)
         if several:
-            guesses = [(cells[longest].mean - cells[shortest].mean) / at / (share[longest] - share[shortest])]
-        else:
-            guesses = [0.003 * total, 0.3 * total, 0.8 * total]
-        for electrons in guesses:
+            electrons = (cells[longest].mean - cells[shortest].mean) / at / (share[longest] - share[shortest])
             rest = sqrt(max(total - electrons * share[shortest], 0.01))
-            tried = () if hidden else NOISES if gain < 2 * FINE else (0.35, 0.6)
             for noise in {*tried, rest}:
                 add(at, cells[shortest].mean - at * electrons * share[shortest], noise, electrons)
+            continue
+        # read noise and dark electrons share the variance of the one exposure
+        for noise in {*tried, *(sqrt(part * total) for part in PARTS)}:
+            electrons = max(total - noise**2, 0.003 * total)
+            add(at, cells[shortest].mean - at * electrons, noise, electrons)
     visible = peaks.noise if peaks else 0.35 if gain >= FINE else 0.15
     return Starts(points, sqrt(variance) / gain if hidden else visible, hidden)
 
@@ -132,13 +136,13 @@ def electron_peaks(cells: Sequence[Cell], gain: float) -> Peaks | None:
     return Peaks(found, noise, float(np.angle(value) / (2 * pi) * found) % found)
 
 
-def distinct(points: Sequence[Array], values: Sequence[float], count: int) -> list[Array]:
-    """Return the `count` likeliest points that differ in gain, offset or read noise."""
+def distinct(points: Sequence[Array], values: Sequence[float], count: int, apart: float) -> list[Array]:
+    """Return the `count` likeliest points that differ in ln gain by `apart`, in offset or in read noise."""
     kept: list[Array] = []
     for i in np.argsort(values)[::-1]:
         point = points[i]
         near = any(
-            abs(point[0] - p[0]) < 0.005 and abs(point[1] - p[1]) < 0.25 * exp(p[0]) and abs(point[2] - p[2]) < 0.3
+            abs(point[0] - p[0]) < apart and abs(point[1] - p[1]) < 0.25 * exp(p[0]) and abs(point[2] - p[2]) < 0.3
             for p in kept
         )
         if not near:
