@@ -126,12 +126,14 @@ def decide(wanted: str | None) -> RenderEngine:
             return RenderEngine(VARIANTS["cuda"], "cuda", None, probe.detail)
         failures.append(f"CUDA: {probe.detail}")
     if wanted in (None, "llvm"):
-        libraries = llvm.candidates()
+        libraries = llvm.usable()
         for path, origin in libraries:
             probe = cached_probe(VARIANTS["llvm"], path)
             if probe.works:
                 return RenderEngine(VARIANTS["llvm"], "llvm", path, f"{probe.detail} {origin}, {path}")
             failures.append(f"{path}: {probe.detail}")
+            if origin == llvm.HELD:
+                failures[-1] += f"; it is the one {origin}: set {llvm.VARIABLE} to a newer one before drjit is imported"
             if path == os.environ.get(llvm.VARIABLE):
                 warnings.warn(f"{llvm.VARIABLE}={failures[-1]}; looking further", RuntimeWarning, stacklevel=3)
         if not libraries:

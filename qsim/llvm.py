@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 OLDEST = 16  # Dr.Jit 1.5 refuses LLVM 14; with LLVM 15 it aborts the process
 VARIABLE = "DRJIT_LIBLLVM_PATH"  # names a library for Dr.Jit
+HELD = "that Dr.Jit loaded when it was imported, before qsim could choose"
 PACKAGE = "karellen-llvm-core"  # LLVM as a wheel: the extra `llvm`
 
 _SYSTEM = (
@@ -47,6 +48,30 @@ class Library(NamedTuple):
 
     path: str
     origin: str  # for messages: "of the system"
+
+
+def usable() -> list[Library]:
+    """Return the libraries to test: the one that Dr.Jit has loaded already, else all `candidates`.
+
+    Dr.Jit loads one when a program imports it, and keeps it. A program that imports Dr.Jit or Mitsuba before `qsim`
+    leaves no choice.
+    """
+    found = candidates()
+    held = _held() if "drjit" in sys.modules else None
+    if held is None:
+        return found
+    same = [library for library in found if os.path.realpath(library.path) == held]
+    return same or [Library(held, HELD)]
+
+
+def _held() -> str | None:
+    """Return the LLVM library that this process has loaded; None without one, or where no /proc tells."""
+    try:
+        lines = Path("/proc/self/maps").read_text().splitlines()
+    except OSError:
+        return None
+    paths = [line.split(maxsplit=5)[5] for line in lines if "LLVM" in line]
+    return next((os.path.realpath(path) for path in paths if _number(path) is not None), None)
 
 
 def candidates() -> list[Library]:

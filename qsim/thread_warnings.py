@@ -24,7 +24,7 @@ class _InSuchABlock(type):
     action: Action
 
     def __subclasscheck__(cls, other: type) -> bool:
-        actions = getattr(_here, "actions", ())
+        actions: list[Action] = getattr(_here, "actions", [])
         return bool(actions) and actions[-1] == cls.action
 
 
@@ -41,7 +41,7 @@ def warnings_here(action: Action) -> Iterator[None]:
     """Raise or ignore every warning that this thread gives in the block."""
     with _lock:
         for kind in (_Refused, _Ignored):
-            if not any(known[2] is kind for known in warnings.filters[:2]):  # the first that matches acts
+            if not any(kind in known for known in warnings.filters[:2]):  # the first that matches acts
                 warnings.simplefilter(kind.action, kind)
     actions = _here.__dict__.setdefault("actions", [])
     actions.append(action)

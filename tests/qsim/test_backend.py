@@ -147,7 +147,7 @@ def test_a_file_that_is_no_library_fails_its_probe(tmp_path):
 
 def test_without_a_usable_llvm_the_scalar_engine_says_what_to_install(monkeypatch):
     failed = backend.Probe("llvm", "old.so", False, "older than LLVM 16")
-    monkeypatch.setattr(llvm, "candidates", lambda: [llvm.Library("old.so", "of the system")])
+    monkeypatch.setattr(llvm, "usable", lambda: [llvm.Library("old.so", "of the system")])
     monkeypatch.setattr(backend, "cached_probe", lambda *args: failed)
     monkeypatch.setattr(backend, "probe_cuda", lambda: backend.Probe("cuda", None, False, "no NVIDIA driver"))
     with pytest.warns(RuntimeWarning, match="apt install libllvm19"):
@@ -173,7 +173,7 @@ def test_a_gpu_without_optix_is_told_what_to_update(monkeypatch):
     assert probe.detail.endswith("update the NVIDIA driver")
     works = backend.Probe("llvm", "new.so", True, "LLVM 19")
     monkeypatch.setattr(backend, "probe_cuda", lambda: probe)
-    monkeypatch.setattr(llvm, "candidates", lambda: [llvm.Library("new.so", "of the system")])
+    monkeypatch.setattr(llvm, "usable", lambda: [llvm.Library("new.so", "of the system")])
     monkeypatch.setattr(backend, "cached_probe", lambda *args: works)
     assert backend.decide(None).backend == "llvm"
     with pytest.raises(ValueError, match=r"engine cuda does not work here \(CUDA: OptiX is missing.*NVIDIA GPU"):
@@ -185,7 +185,7 @@ def test_a_working_gpu_is_taken_first_and_another_engine_can_be_asked_for(monkey
     cuda = backend.Probe("cuda", None, True, "CUDA with OptiX")
     works = backend.Probe("llvm", "new.so", True, "LLVM 19")
     monkeypatch.setattr(backend, "probe_cuda", lambda: cuda)
-    monkeypatch.setattr(llvm, "candidates", lambda: [llvm.Library("new.so", "of the system")])
+    monkeypatch.setattr(llvm, "usable", lambda: [llvm.Library("new.so", "of the system")])
     monkeypatch.setattr(backend, "cached_probe", lambda *args: works)
     variants = {name: backend.decide(name).variant for name in (None, *backend.BACKENDS)}
     assert variants == {None: "cuda_ad_mono", "cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono", "scalar": "scalar_rgb"}

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from compiled_cases import loaded_drjit
 from stats import assert_histogram, assert_mean
 
 from qsim.keys import Key, hash_name, normal, philox4x32, uniform, uniform_pair, words
@@ -13,7 +14,9 @@ from qsim.keys import Key, hash_name, normal, philox4x32, uniform, uniform_pair,
 
 def test_words_are_those_of_dr_jit():
     """Rounds, order of the key's halves and of the counters; Dr.Jit's last counter counts calls, ours redraws."""
-    scalar = pytest.importorskip("drjit.scalar", reason="Dr.Jit is not installed")
+    loaded_drjit()
+    from drjit import scalar
+
     key = Key(12, hash_name("fan_03"), stage=2).philox_key
     assert key >= 2**32
     counters = np.array([[0, 5, 2**32 - 1], [1, 0, 77], [3, 2**31, 9]], np.uint64)

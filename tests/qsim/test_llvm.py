@@ -143,3 +143,26 @@ def test_the_package_renders_without_the_systems_llvm_and_without_its_links(tmp_
     ended = subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     assert str(alone) in ended.stdout
+
+
+def test_a_program_that_imported_drjit_first_draws_with_what_it_has_loaded(tmp_path):
+    """Another library was believed to be in use, and the process ended by SIGABRT on a processor with AVX-512."""
+    code = (
+        "import warnings; warnings.simplefilter('ignore')\n"
+        "import drjit\n"
+        "from qsim import backend, llvm\n"
+        "held, chosen = llvm._held(), backend.choose()\n"
+        "assert chosen.llvm_path in (None, held) or held is None, (chosen, held)\n"
+        "assert chosen.llvm_path or held is None or 'set DRJIT_LIBLLVM_PATH' in chosen.reason, chosen\n"
+        "from qsim import QIS, Key\n"
+        "import numpy as np\n"
+        "sensor, light = QIS(0.8, 1.6, 0.2, bits=3), np.full((2, 9, 7), 3.25)\n"
+        "codes = [sensor.sample(light, 1 / 2000, key=Key(seed=0, clip=0), engine=e) for e in ('auto', 'reference')]\n"
+        "assert (codes[0] == codes[1]).all()\n"
+        "print(chosen.backend)\n"
+    )
+    variables = {name: value for name, value in os.environ.items() if name != llvm.VARIABLE}
+    variables["XDG_CACHE_HOME"] = str(tmp_path)
+    ended = subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.strip() in ("llvm", "scalar", "cuda")

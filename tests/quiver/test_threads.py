@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from clips import ClipMaker, write_clip
+from compiled_cases import loaded_drjit
 
 import qsim.cli.program
 from qsim.clip import sensing
@@ -182,7 +183,7 @@ def test_every_command_that_computes_has_the_option(capsys):
 @two_cores
 def test_the_compiled_engine_has_as_many_and_the_next_command_all(tmp_path, monkeypatch, capsys):
     """Inside the command Dr.Jit and its child processes have the number; after it, the number from before."""
-    drjit = pytest.importorskip("drjit")
+    drjit = loaded_drjit()
     before, seen, plain = drjit.thread_count(), [], sensing.sense
 
     def watched(*args: object, **kwargs: object) -> object:

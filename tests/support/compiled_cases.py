@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,14 @@ from qsim.sensor.spad import BinarySPAD
 
 KEY = Key(seed=3, clip=5, frame=7)
 EXPOSURE = 5e-4  # s
+
+
+def loaded_drjit() -> Any:
+    """Return Dr.Jit with the LLVM that qsim chooses; whoever imports it first gets whichever the system has."""
+    jit.backend()
+    return pytest.importorskip("drjit", reason="Dr.Jit is not installed")
+
+
 needs_engine = pytest.mark.skipif(not jit.available(), reason="no usable LLVM or CUDA on this machine")
 
 SENSORS: dict[str, Sensor] = {

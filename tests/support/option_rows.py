@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import drjit
 import numpy as np
+from compiled_cases import loaded_drjit
 
 from qsim.cli.console import options_of
 
@@ -160,8 +160,9 @@ def execute(main: Main, line: str, folder: Path, capsys: Any, monkeypatch: Any) 
     """Run a command line in a folder, in this process."""
     monkeypatch.chdir(folder)
     capsys.readouterr()
+    dr = loaded_drjit()
     noted = _only_a_note() if line.startswith(NOTE) else contextlib.nullcontext()
-    with noted, mock.patch.object(drjit, "set_thread_count", wraps=drjit.set_thread_count) as asked:
+    with noted, mock.patch.object(dr, "set_thread_count", wraps=dr.set_thread_count) as asked:
         code = main(shlex.split(line.removeprefix(NOTE)))
     captured = capsys.readouterr()
     threads = tuple(call.args[0] for call in asked.call_args_list)

@@ -490,7 +490,7 @@ def test_an_old_llvm(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     monkeypatch.setenv("QSIM_ENGINE", "llvm")
     monkeypatch.setattr(backend, "decided", backend.decide)
-    monkeypatch.setattr(llvm, "candidates", lambda: [llvm.Library("/usr/lib/libLLVM-14.so", "of the system")])
+    monkeypatch.setattr(llvm, "usable", lambda: [llvm.Library("/usr/lib/libLLVM-14.so", "of the system")])
     monkeypatch.setattr(backend, "cached_probe", lambda *_: backend.Probe("llvm", None, False, "older than LLVM 16"))
     err = told(capsys, "qsim doctor")
     assert (
