@@ -1,7 +1,7 @@
 """Makes scenes of a user's folder of meshes, pictures and environments, one per seed.
 
     folder/**  *.obj *.ply *.stl *.off *.glb *.gltf   meshes, each thrown into the air, scaled to 8 to 16 cm
-               *.png *.jpg *.tif *.bmp ...            textures of the meshes, the floor and the wall
+               *.png *.jpg *.tif *.bmp ...            textures of the floor, the wall, and meshes without colours
                *.hdr *.exr                            surroundings, equirectangular, zenith on top; 1 is 1 W m^-2 sr^-1
 
 Missing kinds are replaced by solids, procedural textures, or sun and sky. The bodies fill the view, and in two of three
@@ -17,7 +17,7 @@ import numpy as np
 from qsim import files
 from qsim.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture, Translation
 from qsim.scene.rotation import pose_matrix, vector
-from qsim.scene.shapes import MESH_SUFFIXES, mesh_file, moved
+from qsim.scene.shapes import MESH_SUFFIXES, mesh_file, mesh_material, moved
 from qsim.scene.textures import PICTURE_SUFFIXES
 from qsim.scenes import common, tumble
 from qsim.scenes.common import any_angle, between, pick
@@ -40,7 +40,9 @@ def scene(seed: int = 0, *, speed: float = 1.0, folder: str | Path) -> Scene:
     ]
     for i, place in enumerate(tumble.spread(rng, int(rng.integers(6, 10)))):
         motion = tumble.thrown(rng, place, speed)
-        bodies.append(Body(f"body {i}", _mesh(rng, meshes), _material(rng, pictures), motion))
+        mesh, own = _mesh(rng, meshes)
+        drawn = _material(rng, pictures)
+        bodies.append(Body(f"body {i}", mesh, drawn if own is None else common.finished(own, drawn), motion))
     flight = None if seed % 3 == 0 else _flight(rng, speed)
     view = common.camera((0.0, between(rng, 0.02, 0.14), 0.65), (0, 0, 0), 0.5, flight)
     return Scene(Path(folder).resolve().name, seed, view, (_light(rng, environments),), tuple(bodies), speed)
@@ -57,11 +59,12 @@ def assets(folder: str | Path) -> tuple[list[Path], list[Path], list[Path]]:
     return meshes, pictures, environments
 
 
-def _mesh(rng: np.random.Generator, meshes: list[Path]) -> Mesh:
-    """Return a mesh of the folder, or a solid, 8 to 16 cm across."""
+def _mesh(rng: np.random.Generator, meshes: list[Path]) -> tuple[Mesh, Material | None]:
+    """Return a mesh of the folder with its own colours, if any, or a solid, 8 to 16 cm across."""
     if meshes:
-        return mesh_file(pick(rng, meshes), size=between(rng, 0.08, 0.16))
-    return moved(tumble.shape(rng), pose_matrix(2.5 * np.eye(3)))
+        path = pick(rng, meshes)
+        return mesh_file(path, size=between(rng, 0.08, 0.16)), mesh_material(path)
+    return moved(tumble.shape(rng), pose_matrix(2.5 * np.eye(3))), None
 
 
 def _flight(rng: np.random.Generator, speed: float) -> Translation:

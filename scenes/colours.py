@@ -13,7 +13,18 @@ import numpy as np
 
 from qsim.colour import hue_from_turns
 from qsim.keys import hash_name
-from qsim.scene import AreaLamp, Constant, EnvironmentImage, Light, Material, PointLight, Scene, SunSky, Texture
+from qsim.scene import (
+    AreaLamp,
+    Constant,
+    EnvironmentImage,
+    Light,
+    Material,
+    Patches,
+    PointLight,
+    Scene,
+    SunSky,
+    Texture,
+)
 from qsim.scene.bands import RGB, Colour, has_colour, three
 
 SUN = (1.12, 1.04, 0.84)  # of its mean over the bands, as all tints: a sun some way above the horizon
@@ -41,6 +52,9 @@ def coloured(scene: Scene) -> Scene:
 
 def _painted(material: Material, rng: np.random.Generator) -> Material:
     """Return a material with its reflectance or radiance in colour."""
+    if isinstance(material, Patches):
+        parts: Any = tuple(_painted(part, rng) for part in material.materials)
+        return replace(material, materials=parts)
     found: Any = material
     dark, bright = _tint(rng), _tint(rng)
     names = {field.name for field in dataclasses.fields(found)}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeVar
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,7 @@ from qsim.scene import (
     EnvironmentImage,
     Material,
     Motion,
+    Patches,
     RoughPlastic,
     SunSky,
     Texture,
@@ -122,6 +124,17 @@ def floor(material: Material, size: float = 6.0, y: float = 0.0, z: float = 0.0)
 def paint(rng: np.random.Generator, texture: Texture) -> Material:
     """Return a matt or slightly glossy material, by chance."""
     return Diffuse(texture) if rng.random() < 0.5 else RoughPlastic(texture, roughness=between(rng, 0.15, 0.4))
+
+
+def finished(own: Material, drawn: Material) -> Material:
+    """Return the colours of a mesh file as matt or glossy as a drawn material, with white at a reflectance of 0.9."""
+    if isinstance(own, Patches):
+        parts: Any = tuple(finished(part, drawn) for part in own.materials)
+        return replace(own, materials=parts)
+    assert isinstance(own, Diffuse)
+    assert isinstance(own.reflectance, Texture)
+    colours = replace(own.reflectance, scale=0.9)
+    return replace(drawn, reflectance=colours) if isinstance(drawn, RoughPlastic) else Diffuse(colours)
 
 
 def sun(rng: np.random.Generator, low: float = 0.5, high: float = 1.1, strength: float = 6.0) -> SunSky:

@@ -8,6 +8,7 @@ import numpy as np
 
 from qsim.scene import Body, Diffuse, Scene, Skinned, Still, animated_file
 from qsim.scene.animated.gltf_body import animations_in
+from qsim.scene.shapes import mesh_material
 from qsim.scenes import common
 from qsim.scenes.common import between, pick
 
@@ -17,8 +18,9 @@ SIZE = 0.26  # m, the longest side of the body
 def scene(seed: int = 0, *, speed: float = 1.0, file: str | Path) -> Scene:
     """Return the body of a .glb or .gltf file, 26 cm long or high, in the first pose of one of its animations at t = 0.
 
-    The seed chooses the animation, the direction of the body, textures and light. `speed` is that of the animation,
-    which starts again at its end. `FileNotFoundError` and `ValueError` as `animated_file`.
+    The seed chooses the animation, the direction of the body, textures and light; a body with colours of its own keeps
+    them. `speed` is that of the animation, which starts again at its end. `FileNotFoundError` and `ValueError` as
+    `animated_file` and `mesh_material`.
     """
     rng = np.random.default_rng([seed, 19])
     names = animations_in(file)
@@ -26,10 +28,13 @@ def scene(seed: int = 0, *, speed: float = 1.0, file: str | Path) -> Scene:
     yaw = between(rng, -0.8, 0.8)
     mesh, motion = animated_file(file, SIZE, animation=name, speed=speed, carrier=Still((0, 0, 0), common.upright(yaw)))
     low = float(mesh.vertices[:, 1].min())
+    own = mesh_material(file)
+    backdrops = common.backdrop(rng), common.backdrop(rng)
+    drawn = common.paint(rng, common.surface(rng))
     bodies = (
-        common.floor(Diffuse(common.backdrop(rng)), 2.4, y=low, z=-0.2),
-        common.wall(Diffuse(common.backdrop(rng)), 2.4, 1.2, z=-0.6, y=0.35),
-        Body(name or "body", mesh, common.paint(rng, common.surface(rng)), motion),
+        common.floor(Diffuse(backdrops[0]), 2.4, y=low, z=-0.2),
+        common.wall(Diffuse(backdrops[1]), 2.4, 1.2, z=-0.6, y=0.35),
+        Body(name or "body", mesh, drawn if own is None else common.finished(own, drawn), motion),
     )
     view = common.camera((between(rng, -0.08, 0.08), between(rng, 0.02, 0.12), 0.65), (0, 0, 0), 0.5)
     return Scene(Path(file).stem, seed, view, (common.sun(rng),), bodies, speed)

@@ -11,6 +11,7 @@ from qsim.dataset.job import Job
 
 _ASSETS = {  # kind of a scene's record -> the key of its array or file, and the kind of asset
     "Texture": ("image", "texture"),
+    "Picture": ("colours", "texture"),
     "NormalMap": ("image", "texture"),
     "EnvironmentImage": ("image", "texture"),
     "Mesh": ("vertices", "mesh"),
@@ -47,7 +48,7 @@ def assets(described: Any) -> list[str]:
         if isinstance(item, dict):
             key, kind = _ASSETS.get(str(item.get("kind")), ("", ""))
             value = item.get(key)
-            if isinstance(value, dict):
+            if isinstance(value, dict) and "sha256" in value:
                 found.add(f"{kind} {value['sha256']}")
             elif isinstance(value, str):
                 found.add(f"{kind} {value}")

@@ -14,14 +14,15 @@ from qsim.scene import Mesh
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 
 
-def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any) -> Any:
-    """Return a Mitsuba mesh with these vertices [V, 3] in m; `properties` holds its bsdf and emitter."""
+def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any, faces: range | None = None) -> Any:
+    """Return a Mitsuba mesh with these vertices [V, 3] in m, of all or some faces; `properties` holds its bsdf."""
+    shown = mesh.faces if faces is None else mesh.faces[faces.start : faces.stop]
     properties["face_normals"] = not mesh.smooth
     uv = mesh.uv
     shape = mi.Mesh(
         name,
         len(vertices),
-        len(mesh.faces),
+        len(shown),
         has_vertex_normals=mesh.smooth,
         has_vertex_texcoords=uv is not None,
         props=properties,
@@ -29,7 +30,7 @@ def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any)
     shape.set_id(name)
     parameters = mi.traverse(shape)
     parameters[POSITIONS] = vertices.astype(np.float32).ravel()
-    parameters[FACES] = mesh.faces.astype(np.uint32).ravel()
+    parameters[FACES] = shown.astype(np.uint32).ravel()
     if uv is not None:
         parameters[TEXCOORDS] = uv.astype(np.float32).ravel()
     with errors_only(mi):  # as in `place`

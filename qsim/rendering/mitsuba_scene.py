@@ -21,7 +21,7 @@ from qsim.device_lock import one_thread_at_a_time
 from qsim.rendering import mitsuba_xml
 from qsim.rendering.engine import errors_only, opaque
 from qsim.rendering.mitsuba_mesh import NORMALS, POSITIONS, mesh_shape, vertex_normals
-from qsim.scene import Body, Part, Scene, lights, materials
+from qsim.scene import Body, Mesh, Part, Scene, lights, materials
 from qsim.scene.bands import Colour, largest, numbers
 from qsim.scene.environment import environment_map, sky_map, sun_direction, sun_radiance
 
@@ -65,7 +65,7 @@ class Stage:
         self._time = None  # until all is placed
         for i, body in enumerate(self.scene.bodies):
             if body.motion is not None:
-                self._place_body(f"body{i}", body, t)
+                self._place_body(i, body, t)
         for i, light in enumerate(self.scene.lights):
             motion = getattr(light, "motion", None)
             if motion is not None:
@@ -98,19 +98,26 @@ class Stage:
 
     def shape_numbers(self) -> dict[str, int]:
         """Return shape id -> body number; lamps follow the bodies; the sun's disk is -1 (surroundings)."""
-        numbers = {"sun": -1} | {f"body{i}": i for i in range(len(self.scene.bodies))}
+        numbers = {"sun": -1}
+        for i, body in enumerate(self.scene.bodies):
+            numbers |= {name: i for name, _, _ in _shapes(i, body)}
         numbers |= {f"light{i}": len(self.scene.bodies) + i for i in range(len(self.scene.lights))}
         return numbers | {part.name: i for i, part in enumerate(self.scene.parts)}
 
-    def _place_body(self, name: str, body: Body, t: float) -> None:
+    def first_faces(self) -> dict[str, int]:
+        """Return shape id -> number of its first face in the mesh of its body; 0 where a body is one shape."""
+        return {name: faces.start for i, body in enumerate(self.scene.bodies) for name, _, faces in _shapes(i, body)}
+
+    def _place_body(self, number: int, body: Body, t: float) -> None:
         pose = body.pose(t)
         if _is_instance(body):
-            self._set(f"{name}.to_world", pose, lambda: self._transform(pose))
-        else:
-            world = _to_world(pose, body.vertices(t)).astype(np.float32)
+            self._set(f"body{number}.to_world", pose, lambda: self._transform(pose))
+            return
+        world = _to_world(pose, body.vertices(t)).astype(np.float32)
+        for name, _, _ in _shapes(number, body):
             moved = self._set(f"{name}.{POSITIONS}", world, lambda: world.ravel())
             if moved and body.mesh.smooth:
-                self._normals[f"{name}.{NORMALS}"] = self._normals_of(name, body, pose, world)
+                self._normals[f"{name}.{NORMALS}"] = self._normals_of(f"body{number}", body, pose, world)
 
     def _normals_of(self, name: str, body: Body, pose: Array, world: Array) -> Array:
         """Return unit normals of a smooth body, float32 [V, 3]; a rigid body's are computed once and rotated."""
@@ -231,22 +238,41 @@ def _scene_dict(mi: Any, scene: Scene, smooth_weight: float) -> dict[str, Any]:
     for i, body in enumerate(scene.bodies):
         name = f"body{i}"
         if _is_instance(body):
-            parts[f"group{i}"] = {"type": "shapegroup", "mesh": _mesh(mi, body, "mesh", body.mesh.vertices)}
+            group: dict[str, Any] = {"type": "shapegroup"}
+            for k, (_, material, faces) in enumerate(_shapes(i, body)):
+                inner = f"mesh{k or ''}"
+                group[inner] = _mesh(mi, body.mesh, inner, body.mesh.vertices, material, faces)
+            parts[f"group{i}"] = group
             first = mi.ScalarTransform4f(body.pose(0.0).tolist())
             parts[name] = {"type": "instance", "to_world": first, "group": {"type": "ref", "id": f"group{i}"}}
         else:
-            parts[name] = _mesh(mi, body, name, _to_world(body.pose(0.0), body.vertices(0.0)))
+            world = _to_world(body.pose(0.0), body.vertices(0.0))
+            for shape, material, faces in _shapes(i, body):
+                parts[shape] = _mesh(mi, body.mesh, shape, world, material, faces)
     return parts
 
 
-def _mesh(mi: Any, body: Body, name: str, vertices: Array) -> Any:
+def _shapes(number: int, body: Body) -> list[tuple[str, materials.Material, range]]:
+    """Return name, material and faces of the shapes of a body: one, or one for each of its patches.
+
+    Each shape has all the vertices of the mesh.
+    """
+    if not isinstance(body.material, materials.Patches):
+        return [(f"body{number}", body.material, range(len(body.mesh.faces)))]
+    ends = np.cumsum(body.material.counts).tolist()
+    names = [f"body{number}", *(f"body{number}_{k}" for k in range(1, len(ends)))]
+    faces = [range(start, end) for start, end in zip([0, *ends], ends, strict=False)]
+    return list(zip(names, body.material.materials, faces, strict=True))
+
+
+def _mesh(mi: Any, mesh: Mesh, name: str, vertices: Array, material: materials.Material, faces: range) -> Any:
     properties = mi.Properties()
-    if isinstance(body.material, materials.Glow):
-        properties["emitter"] = mi.load_dict({"type": "area", "radiance": _value(mi, body.material.radiance)})
+    if isinstance(material, materials.Glow):
+        properties["emitter"] = mi.load_dict({"type": "area", "radiance": _value(mi, material.radiance)})
         properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _value(mi, 0.0)})
     else:
-        properties["bsdf"] = mi.load_dict(_bsdf(mi, body.material))
-    return mesh_shape(mi, body.mesh, name, vertices, properties)
+        properties["bsdf"] = mi.load_dict(_bsdf(mi, material))
+    return mesh_shape(mi, mesh, name, vertices, properties, faces)
 
 
 def _light(mi: Any, scene: Scene, light: lights.Light, name: str, smooth_weight: float) -> dict[str, Any]:
@@ -328,14 +354,16 @@ def _reflectance(mi: Any, value: float | Colour | materials.Texture) -> Any:
 
 
 def _texture(mi: Any, texture: materials.Texture, pixels: Array) -> dict[str, Any]:
-    return _bitmap(mi, pixels, texture.repeat, "nearest" if texture.nearest else "bilinear")
+    return _bitmap(mi, pixels, texture.repeat, "nearest" if texture.nearest else "bilinear", texture.wrap)
 
 
-def _bitmap(mi: Any, pixels: Array, repeat: tuple[float, float], kind: str = "bilinear") -> dict[str, Any]:
+def _bitmap(
+    mi: Any, pixels: Array, repeat: tuple[float, float], kind: str = "bilinear", wrap: str = "repeat"
+) -> dict[str, Any]:
     """Return a bitmap texture: row 0 lies at v = 0 in Mitsuba and at v = 1 in our textures."""
     data = mi.TensorXf(np.ascontiguousarray(pixels[::-1], np.float32))
     scale = mi.ScalarTransform4f().scale([repeat[0], repeat[1], 1])
-    return {"type": "bitmap", "data": data, "raw": True, "filter_type": kind, "to_uv": scale}
+    return {"type": "bitmap", "data": data, "raw": True, "filter_type": kind, "to_uv": scale, "wrap_mode": wrap}
 
 
 def _rgb_bitmap(mi: Any, picture: Array) -> Any:

@@ -34,7 +34,8 @@ class RayCaster:
 
     def __init__(self, stage: Stage, backend: str) -> None:
         self._mi, self._stage, self._scalar = stage.mi, stage, backend == "scalar"
-        self._numbers = self._shape_table()
+        self._numbers = self._shape_table(stage.shape_numbers(), -1)
+        self._first_faces = self._shape_table(stage.first_faces(), 0)
 
     def cast(self, pose: Array, rays: Array) -> Hits:
         """Return the first hits along rays [3, N] in the axes of a camera with this pose [4, 4]."""
@@ -54,9 +55,11 @@ class RayCaster:
         distance = dr.select(hit, found.t / length, dr.inf)
         triangle, weights = dr.select(hit, found.prim_index, 0), dr.select(hit, found.prim_uv, 0)
         dr.eval(index, distance, triangle, weights)  # together: separate evaluations would cast the rays again
-        number = self._numbers[np.minimum(np.array(index), len(self._numbers) - 1)]
+        shape = np.minimum(np.array(index), len(self._numbers) - 1)
+        number = self._numbers[shape]
         far = np.where(number >= 0, np.array(distance, np.float64), np.inf)
-        return Hits(far, number, np.array(triangle, np.int64), np.array(weights, np.float64).reshape(2, -1).T)
+        face = np.array(triangle, np.int64) + np.where(number >= 0, self._first_faces[shape], 0)
+        return Hits(far, number, face, np.array(weights, np.float64).reshape(2, -1).T)
 
     def first(self, view: Array, ray: Any) -> tuple[Any, Any]:
         """Return 1 / depth [1/m] along the axis of a camera with this pose [4, 4], and body number + 1, of first hits.
@@ -75,7 +78,7 @@ class RayCaster:
 
     def _cast_one_by_one(self, origin: Array, directions: Array) -> Hits:
         mi = self._mi
-        numbers = self._stage.shape_numbers()
+        numbers, first_faces = self._stage.shape_numbers(), self._stage.first_faces()
         lengths = np.linalg.norm(directions, axis=0)
         distance, number = np.full(len(lengths), np.inf), np.full(len(lengths), -1, np.int32)
         triangle, weights = np.zeros(len(lengths), np.int64), np.zeros((len(lengths), 2))
@@ -83,24 +86,25 @@ class RayCaster:
             ray = mi.Ray3f(origin.tolist(), (direction / length).tolist())
             found = self._stage.loaded.ray_intersect_preliminary(ray)
             if found.is_valid():
-                number[i] = numbers.get((found.instance or found.shape).id(), -1)
-                triangle[i], weights[i] = found.prim_index, found.prim_uv
+                name = (found.instance or found.shape).id()
+                number[i] = numbers.get(name, -1)
+                triangle[i], weights[i] = found.prim_index + first_faces.get(name, 0), found.prim_uv
                 distance[i] = found.t / length if number[i] >= 0 else np.inf
         return Hits(distance, number, triangle, weights)
 
-    def _shape_table(self) -> Array:
-        """Return body numbers by Dr.Jit's registry index; unknown shapes (the sun) are surroundings, -1."""
+    def _shape_table(self, values: dict[str, int], unknown: int) -> Array:
+        """Return the values of shapes, such as body numbers, by Dr.Jit's registry index; unknown ones are the sun."""
         if self._scalar:
             return np.zeros(0, np.int32)
         import drjit as dr
 
-        mi, numbers = self._mi, self._stage.shape_numbers()
+        mi = self._mi
         shapes = self._stage.loaded.shapes()
         pointers: list[Any] = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)) for shape in shapes]
         indices = [int(pointer[0]) for pointer in pointers]
-        table = np.full(max([0, *indices]) + 2, -1, np.int32)
+        table = np.full(max([0, *indices]) + 2, unknown, np.int32)
         for index, shape in zip(indices, shapes, strict=True):
-            table[index] = numbers.get(shape.id(), -1)
+            table[index] = values.get(shape.id(), unknown)
         return table
 
 

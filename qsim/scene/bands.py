@@ -34,6 +34,8 @@ def largest(value: float | Colour) -> float:
 
 def has_colour(record: Any) -> bool:
     """Return whether a material or a light states a quantity, or the picture of one, per band."""
+    if any(has_colour(part) for part in getattr(record, "materials", ())):
+        return True
     values = [getattr(value, "image", value) for name, value in vars(record).items() if name in PER_BAND]
     return any(isinstance(value, tuple) or (isinstance(value, np.ndarray) and value.ndim == 3) for value in values)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy import ndarray as Array
@@ -25,25 +26,33 @@ def read_colour(path: Path) -> np.ndarray:
 
 def _linear(path: Path) -> np.ndarray:
     """Return linear colours [H, W, 3], upright; grey counts with all its 16 bits, colours with the upper 8."""
-    from PIL import Image, ImageOps
-
     if not path.is_file():
         raise FileNotFoundError(f"texture {path}: no such file")
+    return decoded(path, f"texture {path}")
+
+
+def decoded(source: Path | BinaryIO, where: str, *, turned: bool = True) -> np.ndarray:
+    """Return linear colours, float32 [H, W, 3], of an open image file; `ValueError` starts with `where`.
+
+    `turned` applies its orientation tag.
+    """
+    from PIL import Image, ImageOps
+
     try:
-        with Image.open(path) as opened:
+        with Image.open(source) as opened:
             if opened.mode == "F":
                 raise ValueError(
-                    f"texture {path}: holds floating-point numbers, whose white is unknown; store 8 or 16 bits, or "
+                    f"{where}: holds floating-point numbers, whose white is unknown; store 8 or 16 bits, or "
                     "give Texture an array of linear values"
                 )
-            upright = ImageOps.exif_transpose(opened)  # as its orientation tag states
+            upright: Any = ImageOps.exif_transpose(opened) if turned else opened
             if not upright.mode.startswith("I"):
                 return to_linear(np.asarray(upright.convert("RGB")), "srgb", 255)
             grey = np.asarray(upright)
     except (OSError, Image.DecompressionBombError) as error:
-        raise ValueError(f"texture {path}: not a readable image ({error})") from error
+        raise ValueError(f"{where}: not a readable image ({error})") from error
     if grey.min() < 0 or grey.max() > 65535:
-        raise ValueError(f"texture {path}: values of 0 to 65535 are read, found {grey.min()} to {grey.max()}")
+        raise ValueError(f"{where}: values of 0 to 65535 are read, found {grey.min()} to {grey.max()}")
     return np.repeat(to_linear(grey, "srgb", 65535)[..., None], 3, axis=2)
 
 

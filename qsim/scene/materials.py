@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from qsim.checks import require_finite
+from qsim.colour import luminance
 from qsim.scene.bands import Colour, numbers
 from qsim.scene.flicker import Flicker, check_flicker
 from qsim.scene.image_files import read_colour, read_grey
 from qsim.scene.lights import check_light
 
 AIR = 1.000277  # Mitsuba's index around bodies; it raises RuntimeError for a rough surface of the same index
+
+
+WRAPS = ("repeat", "mirror", "clamp")
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """The colours of an image that has been read already: as those of a file, they become luminance in one band."""
+
+    colours: np.ndarray  # float32 [H, W, 3], linear
+
+    def __post_init__(self) -> None:
+        if self.colours.ndim != 3 or self.colours.shape[2] != 3 or not self.colours.size:
+            raise ValueError(f"Picture.colours: expected a picture [H, W, 3], got shape {self.colours.shape}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,14 +39,21 @@ class Texture:
     In a scene of one band, the colours of a file become linear luminance (Rec. 709), and arrays are [H, W].
     """
 
-    image: np.ndarray | str  # float [H, W] linear, in scenes of three bands also [H, W, 3]; or a path
+    image: np.ndarray | str | Picture  # float [H, W] linear, in scenes of three bands also [H, W, 3]; or a path
     repeat: tuple[float, float] = (1.0, 1.0)  # repetitions of the picture in u, v = 0..1
     nearest: bool = False  # nearest texel instead of bilinear
     source: str | None = None  # name of the photograph that the picture shows; data sets record it
     scale: float = 1.0  # factor on all values
+    wrap: str = field(default="repeat", metadata={"described": "if any"})  # beyond 0..1: one of WRAPS
+
+    def __post_init__(self) -> None:
+        if self.wrap not in WRAPS:
+            raise ValueError(f"Texture.wrap: one of {', '.join(WRAPS)} is expected, got {self.wrap!r}")
 
     def pixels(self) -> np.ndarray:
         """Return linear values, float32 [H, W]; `FileNotFoundError` or `ValueError` with the file's name."""
+        if isinstance(self.image, Picture):
+            return self._scaled("Texture.image", luminance(self.image.colours.astype(np.float64)).astype(np.float32))
         if not isinstance(self.image, str | Path):
             pixels = np.asarray(self.image, np.float32)
             where = "Texture.image"
@@ -46,6 +68,8 @@ class Texture:
         """Return linear values of the bands, float32 [H, W, 3], equal in a grey picture; errors as of `pixels`."""
         if isinstance(self.image, str | Path):
             return self._scaled(str(self.image), read_colour(Path(self.image)))
+        if isinstance(self.image, Picture):
+            return self._scaled("Texture.image", self.image.colours)
         pixels = np.asarray(self.image, np.float32)
         if pixels.ndim != 3:
             return np.repeat(self.pixels()[..., None], 3, axis=2)
@@ -160,7 +184,25 @@ class Glow:
         check_flicker(self)
 
 
-Material = Diffuse | RoughPlastic | Conductor | Dielectric | Glow
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Materials of the parts of one mesh: of its first `counts[0]` faces, of the next `counts[1]`, and so on."""
+
+    materials: tuple[Diffuse | RoughPlastic | Conductor | Dielectric, ...]
+    counts: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if not self.materials or len(self.materials) != len(self.counts) or min(self.counts) < 1:
+            raise ValueError(
+                f"Patches: as many materials as counts of faces from 1 are expected, got {len(self.materials)} and "
+                f"{self.counts}"
+            )
+        for material in self.materials:
+            if not isinstance(material, Diffuse | RoughPlastic | Conductor | Dielectric):
+                raise ValueError(f"Patches: a {type(material).__name__} has no parts; give such a body its own mesh")
+
+
+Material = Diffuse | RoughPlastic | Conductor | Dielectric | Glow | Patches
 
 
 def _check_reflectance(material: Diffuse | RoughPlastic) -> None:
@@ -172,6 +214,8 @@ def _check_reflectance(material: Diffuse | RoughPlastic) -> None:
 
 def shows_picture(material: Material) -> bool:
     """Return whether a material places a picture on its surface: a texture or a relief."""
+    if isinstance(material, Patches):
+        return any(shows_picture(part) for part in material.materials)
     return isinstance(getattr(material, "reflectance", None), Texture) or getattr(material, "relief", None) is not None
 
 

@@ -25,7 +25,7 @@ from qsim.optics.camera import Camera, Pose
 from qsim.scene.bands import Bands, check_bands, has_colour, largest
 from qsim.scene.flicker import Flicker
 from qsim.scene.lights import ENVIRONMENTS, Light, strength
-from qsim.scene.materials import Diffuse, Glow, Material, shows_picture
+from qsim.scene.materials import Diffuse, Glow, Material, Patches, shows_picture
 
 
 @runtime_checkable
@@ -79,6 +79,11 @@ class Body:
             raise ValueError(
                 f"body {self.name}: its material shows a picture, and its mesh has no texture coordinates; give Mesh "
                 "uv=, or build it with qsim.scene.shapes.box_mapped"
+            )
+        if isinstance(self.material, Patches) and sum(self.material.counts) != len(self.mesh.faces):
+            raise ValueError(
+                f"body {self.name}: its Patches are of {sum(self.material.counts)} faces, its mesh has "
+                f"{len(self.mesh.faces)}"
             )
 
     def pose(self, t: float) -> np.ndarray:

@@ -7,6 +7,7 @@ mapped face by face (a texture keeps its size in metres), round ones around and 
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qsim.scene.animated.gltf_buffers import check_for_others
+from qsim.scene.animated.gltf_body import GLTF_SUFFIXES, still_pieces
+from qsim.scene.materials import Material
+from qsim.scene.mesh_pieces import Piece, material_of, mesh_of
+from qsim.scene.obj_file import obj_pieces
 from qsim.scene.scene import Mesh
 
 Array = NDArray[np.float64]
@@ -213,15 +217,42 @@ def wire(path: ArrayLike, radius: float, sides: int = 8, closed: bool = False) -
 def mesh_file(path: str | Path, size: float | None = None) -> Mesh:
     """Return all meshes of a file as one, centred on its bounding box; `size` [m] scales its longest side.
 
-    Texture coordinates and normals of the file are left out: faces are flat, and a picture is projected along the
-    nearest axis.
+    Texture coordinates are those of the file (.obj, .glb, .gltf); where it has none, a picture is projected along the
+    nearest axis. Normals of the file are left out: faces are flat. `mesh_material` returns its material.
+    `FileNotFoundError`, or `ValueError` with the name of a file that cannot be read.
     """
+    pieces = _pieces(Path(path))
+    if pieces is None:
+        return _trimesh_file(path, size)
+    return mesh_of(pieces, lambda piece, length: box_mapped(piece.vertices, piece.faces, length), str(path), size)
+
+
+def mesh_material(path: str | Path) -> Material | None:
+    """Return the base colours of an .obj, .glb or .gltf file as the material of its `mesh_file` or `animated_file`.
+
+    A file with several materials has `Patches`. Pictures become luminance in scenes of one band. None if the file
+    states no material, and for other kinds of files. `FileNotFoundError` or `ValueError` for a picture or a file of
+    materials that is missing, lies outside of the folder of the mesh, or cannot be read.
+    """
+    pieces = _pieces(Path(path))
+    return None if pieces is None else material_of(pieces)
+
+
+def _pieces(path: Path) -> list[Piece] | None:
+    """Return the parts of a file with their coordinates and colours; None for a file that can have none."""
+    if not path.is_file():
+        raise FileNotFoundError(f"mesh {path}: no such file")
+    if path.suffix.lower() in GLTF_SUFFIXES:
+        return still_pieces(path)
+    if path.suffix.lower() == ".obj" and re.search(rb"(?m)^\s*(vt|mtllib)\s", path.read_bytes()):
+        return obj_pieces(path)
+    return None
+
+
+def _trimesh_file(path: str | Path, size: float | None) -> Mesh:
+    """Return the mesh of a file without texture coordinates, as `mesh_file`."""
     import trimesh
 
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"mesh {path}: no such file")
-    if Path(path).suffix.lower() in (".glb", ".gltf"):
-        check_for_others(Path(path))
     try:
         loaded: Any = trimesh.load(path, force="mesh")
     except Exception as error:  # trimesh raises many types for a broken file

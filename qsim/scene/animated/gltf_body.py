@@ -1,9 +1,9 @@
-"""Reads one animated body from a glTF file: its mesh, and the motion of its vertices.
+"""Reads one body from a glTF file: animated, its mesh and the motion of its vertices, or at rest, its pieces.
 
-    body.glb -> Mesh, Skinned
+    body.glb -> Mesh, Skinned          body.glb -> pieces
 
 All meshes of the file's scene become one mesh. A mesh with a skin follows the joints of the skin; one without follows
-its node. Normals are computed again from the vertices. Materials, cameras and lights of the file are left out.
+its node. Normals are computed again from the vertices. Cameras and lights of the file are left out.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from qsim.scene.animated.gltf_buffers import Document, entries_of, open_document
+from qsim.scene.animated.gltf_materials import Paints
 from qsim.scene.animated.gltf_nodes import (
     INDICES,
     animation_names,
@@ -28,6 +29,7 @@ from qsim.scene.animated.gltf_nodes import (
 )
 from qsim.scene.animated.skinning import LARGEST, Joint, Morph, Skinned, check_shares
 from qsim.scene.animated.tracks import Clock, Fixed, Keyed, Track
+from qsim.scene.mesh_pieces import Paint, Piece
 from qsim.scene.motion import Motion, Still
 from qsim.scene.rotation import pose_matrix
 from qsim.scene.scene import Mesh
@@ -35,7 +37,7 @@ from qsim.structure import COUNT, Table, expected, is_count, is_number, list_of,
 
 GLTF_SUFFIXES = (".glb", ".gltf")
 ROUNDING = 0.01  # by which the weights of a file may differ from a sum of 1: four bytes round by less
-TRIANGLES = 4
+POINTS, TRIANGLES, STRIP, FAN = 0, 4, 5, 6  # modes; those from points to before triangles are points and lines
 MOST_VERTICES = 5_000_000  # of all pieces of a file
 
 ATTRIBUTES = expected("a table of accessors", mapping_of(r"\w+", is_count))
@@ -43,6 +45,7 @@ PRIMITIVE: Table = {
     "attributes": ATTRIBUTES,
     "indices, if any": COUNT,
     "mode, if any": COUNT,
+    "material, if any": COUNT,
     "targets, if any": expected("a list of tables", list_of(mapping_of(r"\w+", is_count))),
 }
 MESH: Table = {
@@ -64,6 +67,7 @@ class _Piece:
     shares: np.ndarray  # [V, n]
     displacements: np.ndarray  # [M, V, 3]
     weights: Track | None  # [K, M]
+    paint: Paint | None
 
 
 def animations_in(path: str | Path) -> list[str]:
@@ -90,21 +94,53 @@ def animated_file(
     """
     document = open_document(Path(path))
     nodes = nodes_of(document)
-    order, parents = parents_first(document, nodes)
     targets = {i: n for i, node in enumerate(nodes) if (n := _target_count(document, node))}
     tracks = tracks_of(document, chosen_animation(document, animation), nodes, targets)
+    pieces, joints = _read(document, nodes, tracks)
+    clock = Clock(speed, start, max(float(track.times[-1]) for track in tracks.values()), repeat)
+    return _joined(document, pieces, joints, clock, size, carrier or Still())
+
+
+def still_pieces(path: str | Path) -> list[Piece]:
+    """Return the faces of a .glb or .gltf file in the pose of its nodes, without any animation, and their paints.
+
+    Points and lines are left out. Faces have the order of `animated_file`. Errors as of `animated_file`.
+    """
+    document = open_document(Path(path))
+    pieces, joints = _read(document, nodes_of(document), {})
+    raw = _unscaled(pieces, joints)
+    _check_reach(document, raw)
+    vertices, mirrored = raw.deform(0.0), np.linalg.det(raw.matrices(0.0)[:, :3, :3]) < 0
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
+    return [
+        Piece(
+            vertices[start : start + len(piece.vertices)],
+            _outward(piece, mirrored),
+            None if np.isnan(piece.uv).any() else piece.uv,
+            piece.paint,
+        )
+        for start, piece in zip(starts, pieces, strict=False)
+    ]
+
+
+def _read(
+    document: Document, nodes: list[dict[str, Any]], tracks: dict[tuple[int, str], Track]
+) -> tuple[list[_Piece], list[Joint]]:
+    """Return all primitives of the file's scene, and the joints that they follow."""
+    order, parents = parents_first(document, nodes)
     joints, number = joints_of(document, nodes, tracks, order, parents)
-    shown = [i for i in _shown(document, nodes, order, parents) if "mesh" in nodes[i]]
+    paints = Paints(document)
     pieces: list[_Piece] = []
-    for i in shown:
-        for piece in _pieces(document, i, nodes, tracks, joints, number):
+    for i in _shown(document, nodes, order, parents):
+        if "mesh" not in nodes[i]:
+            continue
+        for piece in _pieces(document, i, nodes, tracks, joints, number, paints):
             pieces.append(piece)
             if sum(len(each.vertices) for each in pieces) > MOST_VERTICES:  # a small file can name one array often
                 raise ValueError(f"{document.path}: its meshes have more than {MOST_VERTICES} vertices in all")
     if not pieces:
         raise ValueError(f"{document.path}: its scene has no mesh")
-    clock = Clock(speed, start, max(float(track.times[-1]) for track in tracks.values()), repeat)
-    return _joined(document, pieces, joints, clock, size, carrier or Still())
+    return pieces, joints
 
 
 def _shown(
@@ -146,6 +182,7 @@ def _pieces(
     tracks: Mapping[tuple[int, str], Track],
     joints: list[Joint],
     joint_of: Mapping[int, int],
+    paints: Paints,
 ) -> Iterator[_Piece]:
     """Yield the primitives of a node; joints that a skin adds are appended to `joints`."""
     node = nodes[number]
@@ -155,7 +192,10 @@ def _pieces(
         where = f"meshes[{node['mesh']}].primitives[{i}]"
         primitive = structure(each, PRIMITIVE, f"{document.path}: {where}", closed=False)
         attributes = primitive["attributes"]
-        if primitive.get("mode", TRIANGLES) != TRIANGLES:
+        mode = primitive.get("mode", TRIANGLES)
+        if POINTS <= mode < TRIANGLES and not tracks:
+            continue
+        if mode not in (TRIANGLES, STRIP, FAN):
             raise ValueError(f"{document.path}: {where} is not made of triangles (mode 4); export triangles")
         if "POSITION" not in attributes:
             raise ValueError(f"{document.path}: {where} has no POSITION")
@@ -166,9 +206,8 @@ def _pieces(
         else:
             owners, shares = _influences(document, attributes, where, count, len(bones))
             owners = bones[owners]
-        uv = np.full((count, 2), np.nan)
-        if "TEXCOORD_0" in attributes:  # v runs down in the file, up in a mesh
-            uv = document.array(attributes["TEXCOORD_0"], where, "VEC2", count) * (1, -1) + (0, 1)
+        placed = paints.coordinates(primitive.get("material"), attributes, where, count)
+        uv = np.full((count, 2), np.nan) if placed is None else placed
         displacements = np.array(
             [
                 document.array(target["POSITION"], where, "VEC3", count)
@@ -180,7 +219,8 @@ def _pieces(
         ).reshape(-1, count, 3)
         weights = _weights(document, number, node, mesh, tracks, len(displacements)) if len(displacements) else None
         faces = _faces(document, primitive, where, count)
-        yield _Piece(vertices, faces, uv, "NORMAL" in attributes, owners, shares, displacements, weights)
+        paint = paints.paint(primitive.get("material"), where)
+        yield _Piece(vertices, faces, uv, "NORMAL" in attributes, owners, shares, displacements, weights, paint)
 
 
 def _bones(document: Document, skin: int, by: str, joints: list[Joint], joint_of: Mapping[int, int]) -> np.ndarray:
@@ -238,9 +278,17 @@ def _faces(document: Document, primitive: Mapping[str, Any], where: str, count: 
         corners = np.arange(count)
     else:
         corners = document.array(primitive["indices"], where, "SCALAR")[:, 0]
-    if len(corners) % 3 or corners.dtype != np.int64 or corners.max() >= count or corners.min() < 0:
+    mode = primitive.get("mode", TRIANGLES)
+    whole = len(corners) % 3 == 0 if mode == TRIANGLES else len(corners) >= 3
+    if not whole or corners.dtype != np.int64 or corners.max() >= count or corners.min() < 0:
         raise ValueError(f"{document.path}: {where}: triangles need three indices each, of its {count} vertices")
-    return corners.reshape(-1, 3)
+    if mode == TRIANGLES:
+        return corners.reshape(-1, 3)
+    if mode == FAN:
+        return np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
+    strip = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    strip[1::2] = strip[1::2, [1, 0, 2]]  # every second triangle runs the other way
+    return strip
 
 
 def _joined(
@@ -250,23 +298,8 @@ def _joined(
     if size is not None and not 0 < size < np.inf:
         raise ValueError(f"animated_file: size must be a length above 0 [m], got {size!r}")
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
-    most = max(piece.owners.shape[1] for piece in pieces)
-    wide = [((0, 0), (0, most - piece.owners.shape[1])) for piece in pieces]
-    raw = Skinned(
-        np.concatenate([piece.vertices for piece in pieces]),
-        tuple(joints),
-        np.concatenate([np.pad(piece.owners, pad) for piece, pad in zip(pieces, wide, strict=True)]),
-        np.concatenate([np.pad(piece.shares, pad) for piece, pad in zip(pieces, wide, strict=True)]),
-        tuple(
-            Morph(start, piece.displacements, piece.weights)
-            for start, piece in zip(starts, pieces, strict=False)
-            if piece.weights is not None
-        ),
-    )
-    with np.errstate(over="ignore", invalid="ignore"):
-        reach, moment = _reach(raw), clock.at(0.0)
-    if not reach <= LARGEST:
-        raise ValueError(f"{document.path}: its numbers let vertices move {reach:.2g} m away, beyond {LARGEST:g} m")
+    raw, moment = _unscaled(pieces, joints), clock.at(0.0)
+    reach = _check_reach(document, raw)
     first = raw.deform(moment)
     low, high = first.min(0), first.max(0)
     longest = float((high - low).max())
@@ -281,11 +314,40 @@ def _joined(
     uv = np.concatenate([piece.uv for piece in pieces])
     uv = np.where(np.isnan(uv), vertices[:, :2] / (longest * scale) + 0.5, uv)
     mirrored = np.linalg.det(motion.matrices(moment)[:, :3, :3]) < 0
-    faces = [
-        (piece.faces[:, ::-1] if mirrored[piece.owners[0, 0]] else piece.faces) + start
-        for piece, start in zip(pieces, starts, strict=False)
-    ]
+    faces = [_outward(piece, mirrored) + start for piece, start in zip(pieces, starts, strict=False)]
     return Mesh(vertices, np.concatenate(faces), uv, all(piece.smooth for piece in pieces)), motion
+
+
+def _outward(piece: _Piece, mirrored: np.ndarray) -> np.ndarray:
+    """Return the faces of a piece, wound the other way if its first joint mirrors it."""
+    return piece.faces[:, ::-1] if mirrored[piece.owners[0, 0]] else piece.faces
+
+
+def _unscaled(pieces: list[_Piece], joints: list[Joint]) -> Skinned:
+    """Return all pieces as one motion in the lengths of the file."""
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
+    most = max(piece.owners.shape[1] for piece in pieces)
+    wide = [((0, 0), (0, most - piece.owners.shape[1])) for piece in pieces]
+    return Skinned(
+        np.concatenate([piece.vertices for piece in pieces]),
+        tuple(joints),
+        np.concatenate([np.pad(piece.owners, pad) for piece, pad in zip(pieces, wide, strict=True)]),
+        np.concatenate([np.pad(piece.shares, pad) for piece, pad in zip(pieces, wide, strict=True)]),
+        tuple(
+            Morph(start, piece.displacements, piece.weights)
+            for start, piece in zip(starts, pieces, strict=False)
+            if piece.weights is not None
+        ),
+    )
+
+
+def _check_reach(document: Document, body: Skinned) -> float:
+    """Return a distance [m] that no vertex exceeds; `ValueError` if that is too far."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        reach = _reach(body)
+    if not reach <= LARGEST:
+        raise ValueError(f"{document.path}: its numbers let vertices move {reach:.2g} m away, beyond {LARGEST:g} m")
+    return reach
 
 
 def _reach(body: Skinned) -> float:

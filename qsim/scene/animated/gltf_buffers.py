@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import stat
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,11 +21,11 @@ import numpy as np
 
 from qsim.checks import require_finite
 from qsim.parsing import parse_json
+from qsim.scene.files_beside import file_beside, regular_bytes
 from qsim.structure import COUNT, FLAG, TEXT, WHOLE, Table, expected, structure
 
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-LARGEST = 1 << 31  # bytes of a file that is read
 NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # What a file may require: these change materials or the type of numbers, which are read in any type.
 KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_punctual", "KHR_mesh_quantization")
@@ -95,6 +94,16 @@ class Document:
             raise ValueError(f"{self.path}: {where} is of float numbers, which cannot be normalized")
         return np.maximum(values / float(np.iinfo(kind).max), -1.0)
 
+    def view(self, number: int, by: str) -> bytes:
+        """Return the bytes of a bufferView."""
+        about = self.entry("bufferViews", number, VIEW, by)
+        if about["buffer"] >= len(self.buffers):
+            raise ValueError(f"{self.path}: bufferViews[{number}] names buffers[{about['buffer']}], which is missing")
+        data, start = self.buffers[about["buffer"]], about.get("byteOffset", 0)
+        if start + about["byteLength"] > len(data):
+            raise ValueError(f"{self.path}: bufferViews[{number}] reaches beyond the {len(data)} bytes of its buffer")
+        return data[start : start + about["byteLength"]]
+
     def _patched(self, values: np.ndarray, sparse: Mapping[str, Any], where: str) -> np.ndarray:
         """Return the values with some replaced, of a sparse accessor."""
         count, indices = sparse["count"], sparse["indices"]
@@ -143,17 +152,6 @@ def open_document(path: Path) -> Document:
     return Document(path, content, tuple(_buffer(path, i, each, chunk) for i, each in enumerate(buffers)))
 
 
-def check_for_others(path: Path) -> None:
-    """Raise `ValueError` for a file that another reader (trimesh) would misread, or that leads it out of its folder."""
-    content, _ = _read(path)
-    refuse_required(path, content)
-    for kind in ("buffers", "images"):
-        for i, entry in enumerate(entries_of(path, content, kind)):
-            uri = entry.get("uri") if isinstance(entry, Mapping) else None
-            if isinstance(uri, str) and not uri.startswith("data:"):
-                _file_beside(path, f"{path}: {kind}[{i}]", uri)
-
-
 def _read(path: Path) -> tuple[dict[str, Any], bytes | None]:
     """Return the JSON of a .glb or .gltf file, and the binary chunk of a .glb file that has one."""
     if not path.is_file():
@@ -161,9 +159,16 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes | None]:
     raw = regular_bytes(path, f"mesh {path}")
     text, chunk = _chunks(path, raw) if raw[:4] == b"glTF" else (raw, None)
     try:
-        return parse_json(path, text.decode("utf-8-sig")), chunk
+        return _without_nulls(parse_json(path, text.decode("utf-8-sig"))), chunk
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: neither a .glb nor a .gltf file: {error.reason} at byte {error.start}") from None
+
+
+def _without_nulls(content: Any) -> Any:
+    """Return JSON without keys of the value null, which count as missing."""
+    if isinstance(content, dict):
+        return {key: _without_nulls(value) for key, value in content.items() if value is not None}
+    return [_without_nulls(each) for each in content] if isinstance(content, list) else content
 
 
 def refuse_required(path: Path, content: Mapping[str, Any]) -> None:
@@ -179,14 +184,12 @@ def refuse_required(path: Path, content: Mapping[str, Any]) -> None:
         )
 
 
-def regular_bytes(path: Path, where: str) -> bytes:
-    """Return the bytes of a regular file of at most LARGEST bytes; a pipe or device is refused before it is read."""
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode):
-        raise ValueError(f"{where}: {path} is no regular file")
-    if status.st_size > LARGEST:
-        raise ValueError(f"{where}: {path} has {status.st_size} bytes; at most {LARGEST} are read")
-    return path.read_bytes()
+def data_uri(where: str, uri: str) -> bytes:
+    """Return the bytes of a data: uri in base64."""
+    try:
+        return base64.b64decode(uri.partition(";base64,")[2], validate=True)
+    except (binascii.Error, ValueError):
+        raise ValueError(f"{where}: its data: uri is not base64; the file is damaged") from None
 
 
 def entries_of(path: Path, content: Mapping[str, Any], kind: str) -> list[Any]:
@@ -228,27 +231,9 @@ def _buffer(path: Path, index: int, entry: Any, chunk: bytes | None) -> bytes:
             raise ValueError(f"{where}: the buffer is missing: no uri, and no binary chunk in the file")
         data = chunk
     elif uri.startswith("data:"):
-        try:
-            data = base64.b64decode(uri.partition(";base64,")[2], validate=True)
-        except (binascii.Error, ValueError):
-            raise ValueError(f"{where}: its data: uri is not base64; the file is damaged") from None
+        data = data_uri(where, uri)
     else:
-        data = _file_beside(path, where, uri)
+        data = regular_bytes(file_beside(path, where, unquote(uri)), where)
     if len(data) < about["byteLength"]:
         raise ValueError(f"{where}: {len(data)} bytes, but {about['byteLength']} are stated; the file is truncated")
     return data
-
-
-def _file_beside(path: Path, where: str, uri: str) -> bytes:
-    """Return the bytes of a file that a uri names; it lies beside the document or below, and is a regular one."""
-    name = unquote(uri)
-    if ":" in uri.partition("/")[0] or "\0" in name:
-        raise ValueError(f"{where}: uri {uri[:60]!r}; the name of a file beside it is expected")
-    folder = path.parent.resolve()
-    target = path.parent / name
-    if not target.resolve().is_relative_to(folder):
-        raise ValueError(f"{where}: uri {uri[:60]!r} leads out of {folder}; a file beside it or below is expected")
-    try:
-        return regular_bytes(target, where)
-    except OSError as error:
-        raise FileNotFoundError(f"{where}: the buffer is missing: {target}: {error.strerror}") from None
