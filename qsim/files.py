@@ -88,7 +88,8 @@ def replacing_described(path: Path, description: Path) -> Iterator[tuple[BinaryI
 def _replacing(*paths: Path) -> Iterator[Sequence[BinaryIO]]:
     """Open new files; at the end of the block all but the first old file are deleted and the new ones named in turn."""
     for path in paths:
-        if path.exists() and not path.is_file() and not path.is_dir():
+        mode = _mode(path)
+        if mode is not None and not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
             raise ValueError(f"{path}: is a pipe or a device, not a file; name another output")
     with contextlib.ExitStack() as stack:
         stack.enter_context(naming(paths[0]))
@@ -211,12 +212,17 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     return parse_toml(path, text)
 
 
+def _mode(path: Path) -> int | None:
+    """Return type and permissions of a file, None without one, asked once: another process may replace it meanwhile."""
+    with contextlib.suppress(OSError):
+        return path.stat().st_mode
+    return None
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; `ValueError` as `parse_json`, also for what is no file, or no text."""
-    kind = None
-    with contextlib.suppress(OSError):  # asked once: between two questions another process may replace the file
-        kind = path.stat().st_mode
-    if kind is not None and not stat.S_ISREG(kind):  # a pipe would be waited for
+    mode = _mode(path)
+    if mode is not None and not stat.S_ISREG(mode):  # a pipe would be waited for
         raise ValueError(f"{path}: is a folder, a pipe or a device, not a file; move it away")
     try:
         text = path.read_text(encoding="utf-8")
