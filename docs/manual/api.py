@@ -6,18 +6,18 @@ of their modules. Docstrings are Markdown and become reStructuredText here, whic
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import inspect
 import re
 import shutil
-import textwrap
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages
 from types import ModuleType
 from typing import Any
+
+from qsim.documented_keys import fields_of
 
 PACKAGES = ("qsim", "quiver")
 
@@ -214,30 +214,3 @@ def _code(part: str) -> str:
 
 def _escaped(part: str) -> str:
     return re.sub(r"[*|`\\]|(?<=\w)_(?!\w)", lambda mark: f"\\{mark[0]}", part)
-
-
-def fields_of(kind: type) -> dict[str, str]:
-    """Return the comments behind the fields of a dataclass, those of its bases first."""
-    found: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
-        if dataclasses.is_dataclass(base):
-            found |= _comments(base)
-    return {field.name: found.get(field.name, "") for field in dataclasses.fields(kind) if field.init}
-
-
-def _comments(kind: type) -> dict[str, str]:
-    """Return the comments behind the fields that a class itself defines; a comment may continue below."""
-    lines, _ = inspect.getsourcelines(kind)
-    (tree,) = ast.parse(textwrap.dedent("".join(lines))).body
-    assert isinstance(tree, ast.ClassDef)
-    found = {}
-    for node in tree.body:
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            last = node.end_lineno or node.lineno
-            comment = lines[last - 1].partition("  # ")[2].strip()
-            for line in lines[last:]:
-                if not re.match(r"\s+# ", line) or not comment:
-                    break
-                comment += " " + line.strip().removeprefix("# ")
-            found[node.target.id] = comment
-    return found

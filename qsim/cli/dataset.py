@@ -1,15 +1,15 @@
-"""Runs `qsim generate`, `qsim plan` and `qsim check` on data sets."""
+"""Runs `qsim generate`, `plan` and `check` on data sets, and lists what they take: `qsim recipes`, `qsim sensors`."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from qsim import checks, files
+from qsim import checks, documented_keys, files
 from qsim.cli.console import PILOT, RESUMES, bar, command, note, output
 from qsim.cli.options import checked, part_of
 from qsim.dataset.job import Job, Settings
@@ -149,15 +149,20 @@ def add_recipes(sub: Any) -> None:
     """Add the command `recipes` to a program."""
     parser = command(
         sub, "recipes", _run_recipes, "List the shipped recipes and what each one makes, or print one.",
-        "qsim recipes\nqsim recipes --print starter > mine.toml",
+        "qsim recipes\nqsim recipes --print starter > mine.toml\nqsim recipes --keys",
     )  # fmt: skip
-    parser.add_argument("--print", metavar="NAME", help="print the text of this recipe")
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument("--print", metavar="NAME", help="print the text of this recipe")
+    instead.add_argument("--keys", action="store_true", help="print the keys of a recipe, and what each accepts")
 
 
 def _run_recipes(args: argparse.Namespace) -> int:
     from qsim.dataset import recipe
     from qsim.scenes import RECIPES
 
+    if args.keys:
+        print_keys(args, documented_keys.of_recipes())
+        return 0
     if args.print is not None:
         path, text = recipe.text_of(args.print)
         text = text.replace('"sensors/', f'"{path.resolve().parent}/sensors/')  # a copy elsewhere finds them too
@@ -168,6 +173,36 @@ def _run_recipes(args: argparse.Namespace) -> int:
     width = max(map(len, found))
     lines = [f"{name:{width}}  {_contents(one.jobs)}" for name, one in found.items()]
     output(args, {"recipes": made}, [*lines, "qsim generate NAME makes one; qsim recipes --print NAME prints its text"])
+    return 0
+
+
+def print_keys(args: argparse.Namespace, sections: Mapping[str, Sequence[documented_keys.Key]]) -> None:
+    """Print the keys of the sections of a file."""
+    found = {section: [key._asdict() for key in keys] for section, keys in sections.items()}
+    output(args, {"sections": found}, documented_keys.lines(sections))
+
+
+def add_sensors(sub: Any) -> None:
+    """Add the command `sensors` to a program."""
+    parser = command(
+        sub, "sensors", _run_sensors, "List the named sensors, or the keys of a sensor file.",
+        "qsim sensors\nqsim sensors --keys",
+    )  # fmt: skip
+    parser.add_argument(
+        "--keys", action="store_true", help="print the keys of a sensor file instead, and what each accepts"
+    )
+
+
+def _run_sensors(args: argparse.Namespace) -> int:
+    from qsim.sensor.devices import DEVICES
+
+    if args.keys:
+        print_keys(args, documented_keys.of_sensor_files())
+        return 0
+    width = max(map(len, DEVICES))
+    lines = [f"{name:{width}}  {device.what}" for name, device in DEVICES.items()]
+    more = "qsim sense CLIP --sensor NAME draws with one; qsim doctor --devices prints every number with its source"
+    output(args, {"sensors": {name: device.what for name, device in DEVICES.items()}}, [*lines, more])
     return 0
 
 

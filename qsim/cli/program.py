@@ -16,7 +16,7 @@ from qsim.cli.compare import add_compare
 from qsim.cli.completion import add_completion, families, recipes, sensors
 from qsim.cli.console import OPTIONAL, Parser, command, output, run
 from qsim.cli.convert import add_convert
-from qsim.cli.dataset import add_check, add_generate, add_plan, add_recipes
+from qsim.cli.dataset import add_check, add_generate, add_plan, add_recipes, add_sensors
 from qsim.cli.demo import add_demo
 from qsim.cli.look import add_explore, add_preview, add_report
 from qsim.cli.render import add_render
@@ -44,6 +44,7 @@ def parser() -> Parser:
         add_plan,
         add_check,
         add_recipes,
+        add_sensors,
         add_convert,
         add_preview,
         add_report,

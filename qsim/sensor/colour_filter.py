@@ -9,8 +9,8 @@ collects of sum_b (efficiency[c][b] / efficiency) photons_b: its exact law, its 
     [colour]
     mask = "rggb"                      # or another of MASKS, or rows of a tile: ["RG", "GB"]
     efficiency.R = 0.45                # of red photons; or of R, G and B photons: [0.45, 0.04, 0.01]
-    efficiency.G = 0.60
-    efficiency.B = 0.50
+    efficiency.G = 0.60                # of green photons, likewise
+    efficiency.B = 0.50                # of blue photons, likewise
     efficiency.W = [0.70, 0.75, 0.60]  # of a colour that is none of R, G and B
 
 Without `efficiency` a filter passes all light of its band, and W of all bands, to the efficiency of the sensor.

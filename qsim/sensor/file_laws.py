@@ -8,6 +8,10 @@
     dark_reference = 25.0          # degrees C at which the dark rate is stated
     temperature = 40.0             # degrees C of the sensor; default: dark_reference
     qe_curve = [[450e-9, 0.30], [550e-9, 0.50], [650e-9, 0.35]]  # m, efficiency, in place of pde
+    iso = 100                      # QIS: gain = iso / 100 (2^bits - 1 - offset) / full_well, in place of gain
+
+    [sources]
+    median = "data sheet, page 3"  # where the number of this key of [sensor] comes from; one line per key
 
     dark rate = stated rate * 2^((temperature - dark_reference) / dark_doubling)
 

@@ -41,7 +41,7 @@ class SpikeCamera(Sensor):
     quantum_efficiency: float  # electrons per photon, 0 ... 1
     dark_current: float  # e-/s
     threshold: int  # e-, 1 ... 2^20
-    subtracts: bool = True  # reset by subtraction: bright pixels glow on (see above); False: to zero
+    subtracts: bool = True  # reset by subtraction: bright pixels glow on; false: to zero
     bits: int = 1
 
     code_model: ClassVar[str] = "spikes"

@@ -48,6 +48,7 @@ WORDS = {  # a line that each parser takes
     "plan": "plan t.toml",
     "check": "check clip",
     "recipes": "recipes",
+    "sensors": "sensors",
     "demo": "demo t.toml",
     "convert": CODES,
     "preview": "preview clip",
@@ -108,6 +109,11 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("validate", "--json"): [Acts(ENGINES, "--json", stdout, slow=True)],
     ("demo", "--json"): [Acts("demo t.toml", "--json", stdout, codes=(2,))],
     ("recipes", "--print"): [Acts("recipes", "--print demo", stdout), Refused("recipes", "--print none", "no such")],
+    ("recipes", "--keys"): [
+        Acts("recipes", "--keys", stdout),
+        Refused("recipes --print demo", "--keys", "not allowed with"),
+    ],
+    ("sensors", "--keys"): [Acts("sensors", "--keys", stdout)],
     ("doctor", "--devices"): [Acts("doctor", "--devices", stdout)],
     # render
     ("render", "--threads"): [Acts(f"{RENDER} -o r", "--threads 1", threads, slow=True)],
