@@ -182,6 +182,14 @@ PLACE = expected("[y, x] in pixels", list_of(is_count, 2))
 SPLIT = expected(f"one of {', '.join(SPLITS)}", lambda value: value in SPLITS)
 OBJECT: Table = {}
 
+LENS: Table = {
+    "k1": NUMBER,
+    "k2": NUMBER,
+    "falloff": expected("a list of numbers", list_of(is_number)),
+    "shift": expected("two numbers", list_of(is_number, 2)),
+    **{f"{key}, if any": NUMBER for key in ("k3", "k4", "p1", "p2", "aspect")},
+}
+_several = expected("a list", lambda value: isinstance(value, list))
 CAMERA: Table = {
     "focal_length": POSITIVE,
     "f_number": POSITIVE,
@@ -197,12 +205,11 @@ CAMERA: Table = {
     "focus_distance, if any": POSITIVE,
     "vignetting, if any": FLAG,
     "aperture_blur, if any": FLAG,
-    "lens, if any": {
-        "k1": NUMBER,
-        "k2": NUMBER,
-        "falloff": expected("a list of numbers", list_of(is_number)),
-        "shift": expected("two numbers", list_of(is_number, 2)),
-        **{f"{key}, if any": NUMBER for key in ("k3", "k4", "p1", "p2", "aspect")},
+    "lens, if any": LENS,
+    "zoom, if any": {
+        "times": expected("a list of numbers", list_of(is_number)),
+        "distances": expected("a list of numbers above 0", list_of(is_positive)),
+        "lenses": lambda value: [structure(each, LENS, "a lens", closed=False) for each in _several(value)],
     },
 }
 

@@ -10,6 +10,7 @@ from typing import Any
 from qsim import files, structure
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
+from qsim.optics.zoom import Zoom
 
 FORMAT_VERSION = 1
 PHYSICAL = "W m^-2 sr^-1"
@@ -60,11 +61,19 @@ def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:
             values[key] = tuple(values[key])
     try:
         if values.get("lens") is not None:
-            lens = {key: value for key, value in values["lens"].items() if key != "kind" and value is not None}
-            values["lens"] = Lens(**lens | {key: tuple(lens[key]) for key in ("falloff", "shift")})
+            values["lens"] = _lens_of(values["lens"])
+        if values.get("zoom") is not None:
+            zoom = values["zoom"]
+            lenses = tuple(_lens_of(lens) for lens in zoom["lenses"])
+            values["zoom"] = Zoom(tuple(zoom["times"]), tuple(zoom["distances"]), lenses)
         return Camera(**values)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: camera: {error}") from None
+
+
+def _lens_of(described: dict[str, Any]) -> Lens:
+    lens = {key: value for key, value in described.items() if key != "kind" and value is not None}
+    return Lens(**lens | {key: tuple(lens[key]) for key in ("falloff", "shift")})
 
 
 def check_new(path: Path, meta: dict[str, Any]) -> None:

@@ -103,7 +103,7 @@ def clip_photons(
         y, x, height, width = crop
         return whole[..., y : y + height, x : x + width]
     radiance = clip.sharp(t, crop) if sharp else clip.radiance(t, crop)
-    camera = clip.camera
+    camera = None if clip.camera is None else clip.camera.at(t / clip.frame_rate)
     if camera is None:
         if diffraction:
             raise ValueError(f"{clip.name}: diffraction needs a camera, and this clip's radiance is relative")

@@ -151,10 +151,11 @@ class ClipWriter:
         if self._camera is not None:
             origin = tuple(self.meta.get("origin", (0, 0)))
             bands, exposure = self.meta.get("bands"), self.meta["exposure"]
+            camera = self._camera.at(t / self.meta["frame_rate"])
             photons = (
-                radiometry.expected_photons(stored, self._camera, exposure, origin=origin)
+                radiometry.expected_photons(stored, camera, exposure, origin=origin)
                 if bands is None
-                else radiometry.band_photons(stored, self._camera, exposure, bands, origin=origin)
+                else radiometry.band_photons(stored, camera, exposure, bands, origin=origin)
             )
             entry["mean_photons"] = float(photons.mean())
         self._frames[t] = entry

@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from qsim.optics.lens import Lens
+from qsim.optics.zoom import Zoom
 
 Vector = tuple[float, float, float]
 
@@ -52,6 +53,8 @@ class Camera:
     aperture_blur: bool = False  # thin lens of diameter focal_length / f_number instead of a pinhole
     focus_distance: float | None = None  # m; None: distance from origin to target
     lens: Lens | None = field(default=None, metadata={"described": "if any"})  # distortion, fall-off; None: ideal
+    # A view that changes; `focal_length` and `lens` are then those of a moment, and `at` gives those of any
+    zoom: Zoom | None = field(default=None, metadata={"described": "if any"})
 
     def __post_init__(self) -> None:
         checked_pitch(self.pixel_pitch, "Camera.pixel_pitch")
@@ -85,7 +88,21 @@ class Camera:
         if self.lens == Lens():
             object.__setattr__(self, "lens", None)
         if self.lens is not None:
-            self.lens.check(self.corner)
+            _check(self.lens, self.corner)
+        if self.zoom is not None:
+            for t in self.zoom.moments():
+                self._zoomed(t)
+
+    def at(self, t: float) -> Camera:
+        """Return the camera as it is at time t [s]: the same one unless it has a `zoom`. Its motion stays."""
+        return self if self.zoom is None else _at(self, float(t))
+
+    def _zoomed(self, t: float) -> Camera:
+        assert self.zoom is not None
+        share, lens = self.zoom.at(t)
+        distance = share * self.height * self.pixel_pitch
+        focal_length = distance * self.focus / (distance + self.focus) if self.aperture_blur else distance
+        return replace(self, zoom=None, focal_length=focal_length, lens=lens)
 
     @property
     def image_distance(self) -> float:
@@ -188,6 +205,8 @@ class Camera:
 
     def project(self, points: np.ndarray, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """Project world points [..., 3] [m] to pixels [..., 2] (x, y; first pixel centre 0.5) and depth z [...] [m]."""
+        if self.zoom is not None:
+            return self.at(t).project(points, t)
         pose = self.pose(t)
         local = (np.asarray(points, np.float64) - pose[:3, 3]) @ pose[:3, :3]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -195,6 +214,16 @@ class Camera:
             shown = slopes if self.lens is None else self.lens.seen(slopes)
             pixels = shown * self.focal_pixels + self.axis
         return pixels, local[..., 2]
+
+
+@functools.lru_cache(maxsize=64)
+def _at(camera: Camera, t: float) -> Camera:
+    return camera._zoomed(t)
+
+
+@functools.lru_cache(maxsize=4096)
+def _check(lens: Lens, corner: float) -> None:
+    lens.check(corner)
 
 
 def _pixel_slopes(height: int, width: int, axis: tuple[float, float], focal_pixels: float) -> np.ndarray:

@@ -73,14 +73,20 @@ class Film:
 
 
 class CameraRays:
-    """Rays of a camera on a parallel engine."""
+    """Rays of a camera on a parallel engine. Numbers that change with time are data, so that they compile no kernel."""
 
-    def __init__(self, mi: Any, camera: Camera) -> None:
-        self._mi, self._camera = mi, camera
+    def __init__(self, mi: Any, camera: Camera, *, changes: bool = False) -> None:
+        self._mi, self._camera, self._changes = mi, camera, changes
         lens = camera.lens
         self._bends: _Bends | _Warp | None = None
         if lens is not None and lens.bends:
             self._bends = _Warp(mi, camera, lens) if lens.tangential else _Bends(mi, camera, lens)
+
+    def at(self, t: float) -> CameraRays:
+        """Return the rays of time t [s]: the same ones unless the camera has a `zoom`."""
+        if self._camera.zoom is None:
+            return self
+        return CameraRays(self._mi, self._camera.at(t), changes=True)
 
     def through(self, pose: Array, position: Any, sampler: Any) -> Any:
         """Return rays through film positions [px]; the pose is data, not code, so that motion compiles no kernel."""
@@ -88,16 +94,17 @@ class CameraRays:
 
         mi, camera = self._mi, self._camera
         axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in pose[:3, i])) for i in range(4)]
-        f, (x, y) = camera.focal_pixels, camera.axis
-        across = (position.x - x) / (f * camera.aspect)
-        down = (position.y - y) / f
+        numbers = (camera.focal_pixels * camera.aspect, camera.focal_pixels, *camera.axis, camera.pupil_radius)
+        f_x, f_y, x, y, pupil = (dr.opaque(mi.Float, n) for n in numbers) if self._changes else numbers
+        across = (position.x - x) / f_x
+        down = (position.y - y) / f_y
         if self._bends is not None:
             across, down = self._bends.traced(across, down)
         direction = axes[0] * across + axes[1] * down + axes[2]
         origin = axes[3]
         if camera.aperture_blur:
             focus = camera.focus
-            lens = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * (camera.pupil_radius)
+            lens = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * pupil
             shift = axes[0] * lens.x + axes[1] * lens.y
             origin = origin + shift
             direction = direction * focus - shift

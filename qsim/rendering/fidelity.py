@@ -326,6 +326,11 @@ def flickering(strengths: dict[str, Array], extent: Array, instants: int) -> tup
 
 def _lens(camera: Camera) -> tuple[Finding, ...]:
     """Return a finding for a lens that is not ideal: how far it moves the corner, and the light left there."""
+    if camera.zoom is not None:
+        views = [camera.at(t) for t in camera.zoom.times]
+        shown = sorted(view.focal_pixels for view in views)
+        size = f"focal length {shown[0]:.4g} to {shown[-1]:.4g} px, with a distortion that changes alike"
+        return (Finding("lens", "exact rays", size),)
     if camera.lens is None:
         return ()
     away = [max((at, at - size), key=abs) for at, size in zip(camera.axis, (camera.width, camera.height), strict=True)]
@@ -341,7 +346,8 @@ def effects_left_out(camera: Camera, truths: list[dict[str, Array]], bands: Band
     depths = np.concatenate([truth["depth"].ravel() for truth in truths])
     depths = np.where(np.isinf(depths), 1e9, depths)  # the surroundings
     depths = depths[depths > camera.focal_length]
-    blur = float(np.max(camera.circle_of_confusion(depths), initial=0.0))
+    views = [camera] if camera.zoom is None else [camera.at(t) for t in camera.zoom.times]
+    blur = max(float(np.max(view.circle_of_confusion(depths), initial=0.0)) for view in views)
     how = "thin lens" if camera.aperture_blur else "left out, pinhole"
     return (
         Finding("depth of field", how, f"largest blur circle {blur:.2g} px at f/{camera.f_number:g}"),

@@ -39,7 +39,7 @@ def flow_between(scene: Scene, rays: Array, hits: Hits, t: float, later: float) 
     `rays` [3, N] are those of the hits at time t. The later rays [3, N] are in the later camera's axes, with the
     points at `hits.distance` lengths. For a point behind the later camera, flow is 0 and not inside.
     """
-    camera = scene.camera
+    before, camera = scene.camera.at(t), scene.camera.at(later)
     start, end = seen_again(scene, rays, hits, t, later)
     ahead = end[2] > 0
     place = camera.seen(end[:2] / np.where(ahead, end[2], 1.0))
@@ -47,8 +47,14 @@ def flow_between(scene: Scene, rays: Array, hits: Hits, t: float, later: float) 
     for along, axis, size in zip(place, camera.axis, (camera.width, camera.height), strict=True):
         low, high = (edge / camera.focal_pixels for edge in (axis, size - axis))
         inside = inside & (along >= -low) & (along <= high)
-    flow = np.where(ahead, place - camera.seen(start[:2] / start[2]), 0.0) * camera.focal_pixels
-    return flow, inside, end
+    if before is camera:
+        flow = np.where(ahead, place - camera.seen(start[:2] / start[2]), 0.0) * camera.focal_pixels
+        return flow, inside, end
+    ends = [
+        view.seen(slopes) * view.focal_pixels + np.array(view.axis)[:, None]
+        for view, slopes in ((before, start[:2] / start[2]), (camera, end[:2] / np.where(ahead, end[2], 1.0)))
+    ]
+    return np.where(ahead, ends[1] - ends[0], 0.0), inside, end
 
 
 def motion_extent(scene: Scene, rays: Array, hits: Hits, t: float, exposure: float, *, sharp: bool) -> Array:

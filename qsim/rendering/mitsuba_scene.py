@@ -181,13 +181,15 @@ def film_pass(
 ) -> Array:
     """Render a window (y, x, height, width) with Mitsuba's own camera and film: radiance, float64 [H, W].
 
-    `ValueError` for a lens that distorts, or whose axis is off the middle: that camera has none.
+    `ValueError` for a lens that distorts, zooms, or whose axis is off the middle: that camera has none.
     """
     mi, camera = stage.mi, stage.scene.camera
-    if camera.lens is not None and (camera.lens.distorts or camera.lens.shift != (0.0, 0.0)):
+    shifted = camera.lens is not None and (camera.lens.distorts or camera.lens.shift != (0.0, 0.0))
+    if shifted or camera.zoom is not None:
         raise ValueError(
-            "Camera.lens: Mitsuba's own camera, which the scalar engine and `qsim validate render` use, has no "
-            "distortion and no shift; install LLVM for the engine, or choose another scene"
+            f"Camera.{'lens' if shifted else 'zoom'}: Mitsuba's own camera, which the scalar engine and `qsim validate "
+            f"render` use, has no distortion {'and no shift' if shifted else 'and no zoom'}; install LLVM for the "
+            "engine, or choose another scene"
         )
     y, x, height, width = crop
     film: dict[str, Any] = {

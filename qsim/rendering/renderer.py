@@ -196,15 +196,15 @@ class Renderer:
             self.stage.place(instant)
             if self.scene.flickers:
                 self.stage.light(*windows[i])
-            pose = self.scene.camera.pose(instant)
             if self.engine.backend == "scalar":
+                pose = self.scene.camera.pose(instant)
                 integrator = self._integrator(budget.bounces)
                 images = [film_pass(self.stage, pose, self.crop, int(s), samples, integrator) for s in seeds[:, i, 0]]
                 thin = [image[:: self.film.thinned, :: self.film.thinned] for image in images]
                 drawn[:] = np.reshape(thin, drawn.shape)
             else:
                 for part, seed in zip(parts, seeds[0, i], strict=True):
-                    drawn[..., part.start : part.stop] = self._pass(pose, int(seed), samples, budget.bounces, part)
+                    drawn[..., part.start : part.stop] = self._pass(instant, int(seed), samples, budget.bounces, part)
             sums[0] += drawn / n
             if i % 3 == 1:
                 sums[1] += drawn * 3 / n
@@ -279,7 +279,7 @@ class Renderer:
             self.stage.place(instant)
             for part, seed in zip(parts, row, strict=True):
                 sampler, position = self.film.positions(int(seed), samples, part)
-                ray = self.film.rays.through(self.scene.camera.pose(instant), position, sampler)
+                ray = self.film.rays.at(instant).through(self.scene.camera.pose(instant), position, sampler)
                 found = self.stage.loaded.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
                 bsdf = found.bsdf(ray)
                 seen = found.is_valid()
@@ -294,8 +294,10 @@ class Renderer:
         means_of = sums.reshape(-1, *self.shape) / len(instants)
         return means_of[0] if colours == 1 else means_of[:3], np.stack(list(means_of[colours:]), axis=-1)
 
-    def _pass(self, pose: Array, seed: int, samples: int, bounces: int, part: range) -> Array:
+    def _pass(self, instant: float, seed: int, samples: int, bounces: int, part: range) -> Array:
         """Return two independent estimates of these pixels' radiance, float64 [2, (3,) N], `samples` per pixel each.
+
+        They are those of the instant [s] at which the stage is placed.
 
         One launch computes both: a launch costs as much as several samples of a small frame.
         """
@@ -303,7 +305,7 @@ class Renderer:
 
         integrator = self._integrator(bounces)  # first: loading it later would change the kernel once
         sampler, position = self.film.positions(seed, samples, part, 2)
-        ray = self.film.rays.through(pose, position, sampler)
+        ray = self.film.rays.at(instant).through(self.scene.camera.pose(instant), position, sampler)
         radiance, _, _ = integrator.sample(self.stage.loaded, sampler, ray)
         means = [dr.block_sum(radiance[band], samples) / samples for band in range(len(radiance))]
         dr.eval(*means)  # together: each alone would trace the rays again
@@ -321,7 +323,7 @@ class Renderer:
     def truth(self, t: int) -> dict[str, Array]:
         """Return flow, validity, depth and body of frame t at mid-exposure, as in `Frame`."""
         camera, now, after, shape = self.scene.camera, self.time(t), self.time(t + 1), self.shape
-        rays = pixel_rays(camera, self.crop, self.film.thinned)
+        rays = pixel_rays(camera.at(now), self.crop, self.film.thinned)
         self.stage.place(now)
         hits = self._caster.cast(camera.pose(now), rays)
         flow, inside, then = ground_truth.flow_between(self.scene, rays, hits, now, after)
@@ -343,7 +345,7 @@ class Renderer:
         With the shutter at 0, it is the motion per frame time at the speed of that instant.
         """
         now, exposure = self.time(t), self.exposure
-        rays = pixel_rays(self.scene.camera, self.crop, self.film.thinned)
+        rays = pixel_rays(self.scene.camera.at(now), self.crop, self.film.thinned)
         self.stage.place(now)
         hits = self._caster.cast(self.scene.camera.pose(now), rays)
         extent = ground_truth.motion_extent(self.scene, rays, hits, now, exposure, sharp=self.shutter == 0)

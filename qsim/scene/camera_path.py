@@ -2,10 +2,11 @@
 
     transforms.json -> Camera whose motion passes every pose        Camera + times -> transforms.json
 
-A file holds one lens and a list of camera-to-world matrices, in camera axes x right, y up, z back (OpenGL) and a world
-whose z points up. Here the camera's axes are x right, y down, z forward, and the world's y points up: (x, y, z) of the
-file is (x, z, -y), exactly. Between poses the position follows a cubic Hermite path and the rotation is uniform (slerp,
-`Keyframes`); before the first and after the last the camera rests. Poses are equally spaced in time.
+A file holds a lens, or one per picture, and a list of camera-to-world matrices. Its camera axes are x right, y up and z
+back (OpenGL), and the z of its world points up. Here the camera's axes are x right, y down, z forward, and the world's
+y points up: (x, y, z) of the file is (x, z, -y), exactly. Between poses the position follows a cubic Hermite path and
+the rotation is uniform (slerp, `Keyframes`); before the first and after the last the camera rests. Poses are equally
+spaced in time. Where lenses differ, focal length, principal point and distortion follow such paths, too (`Zoom`).
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from qsim.checks import MAX_PIXELS
 from qsim.file_order import natural
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
+from qsim.optics.zoom import Zoom
 from qsim.scene.motion import Keyframes
 from qsim.scene.rotation import logarithm, vector
 from qsim.structure import FLAG, NUMBER, POSITIVE, TEXT, Table, expected, is_number, list_of, structure
@@ -51,6 +53,8 @@ _LENS: Table = {
     **{f"{key}, if any": FLAG for key in OTHER_LENSES},
 }
 _KEYS = tuple(key.removesuffix(", if any") for key in _LENS)
+_FOCAL = frozenset({"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"})
+_MAY_CHANGE = _FOCAL | {"cx", "cy", *TERMS}
 _FILE: Table = {
     **_LENS,
     "frames": expected("a list of frames", lambda v: isinstance(v, list) and all(isinstance(f, dict) for f in v)),
@@ -84,8 +88,10 @@ def read_camera_path(
 
     Where fl_x and fl_y differ, pixels are as high as in `like`, and fl_x / fl_y times narrower.
 
-    `FileNotFoundError`, or `ValueError` for less than two poses, a pose that is no rotation, lenses of several cameras,
-    fisheye lenses and other models, all of them named at once.
+    Lenses that differ from frame to frame become the camera's `zoom`; what a frame does not state, the file does.
+
+    `FileNotFoundError`, or `ValueError` for less than two poses, a pose that is no rotation, pictures of several sizes
+    or models, fisheye lenses and other models, all of them named at once.
     """
     where = str(path)
     if not Path(path).is_file():
@@ -99,8 +105,10 @@ def read_camera_path(
     if rate is None:
         raise ValueError(f"{where}: states no frame_rate; give the poses per second, as in frame_rate=30")
     poses = [_pose(frame, scale) for frame in frames]
-    found = content | _common(frames)
-    _check_lens(content, frames, found, where)
+    views = [_view(content, frame) for frame in frames]
+    found = views[0]
+    differing = [key for key in _KEYS if any(view.get(key) != found.get(key) for view in views)]
+    _check_lens(found, [key for key in differing if key not in _MAY_CHANGE], where)
     if size is not None and not all(found.get(key) for key in ("w", "h")):
         pixels = [key for key in ("fl_x", "fl_y", "cx", "cy") if found.get(key) is not None]
         if pixels:
@@ -110,28 +118,57 @@ def read_camera_path(
         like = (like or PLAIN).resized(*size)
     placed = _seen_from(found, where, like or PLAIN, poses[0], like is not None)
     inside = [np.linalg.inv(placed.pose()) @ pose for pose in poses]
+    times = tuple(i / (rate * speed) for i in range(len(poses)))
     motion = Keyframes(
-        tuple(i / (rate * speed) for i in range(len(poses))),
+        times,
         tuple(vector(pose[:3, 3]) for pose in inside),
         tuple(vector(logarithm(pose[:3, :3])) for pose in inside),
     )
-    return replace(placed, motion=motion)
+    if not differing:
+        return replace(placed, motion=motion)
+    cameras = [
+        _seen_from(view, frame["where"], like or PLAIN, pose, like is not None)
+        for view, frame, pose in zip(views, frames, poses, strict=True)
+    ]
+    zoom = Zoom(
+        times,
+        tuple(camera.focal_pixels / camera.height for camera in cameras),
+        tuple(camera.lens or Lens() for camera in cameras),
+    )
+    try:
+        return replace(placed, motion=motion, zoom=zoom)
+    except ValueError as error:
+        raise ValueError(f"{where}: between two poses: {error}") from None
 
 
 def camera_path(
     camera: Camera, poses: Sequence[Array], names: Sequence[str], frame_rate: float, origin: tuple[int, int] = (0, 0)
 ) -> dict[str, Any]:
-    """Return the content of a transforms.json: a lens, and a pose per picture of `names`.
+    """Return the content of a transforms.json: a lens, or one per picture, and a pose per picture of `names`.
 
     `poses` are camera-to-world matrices [4, 4] in the camera's axes of this program, `frame_rate` of them per second;
     `origin` is the (y, x) of the pictures' first pixel in the frame of the camera, and their size is `camera`'s.
     """
-    lens, (x, y) = camera.lens or Lens(), camera.axis
+    views = [_intrinsics(camera.at(i / frame_rate), origin) for i in range(len(poses))]
+    common = views[0] if camera.zoom is None else {}
     placed = [UPRIGHT.T @ np.asarray(pose, np.float64) @ FLIP for pose in poses]
     return {
         "camera_model": "OPENCV",
         "w": camera.width,
         "h": camera.height,
+        **common,
+        "frame_rate": float(frame_rate),
+        "frames": [
+            {"file_path": name, "transform_matrix": (pose + 0.0).tolist()} | ({} if common else view)
+            for name, pose, view in zip(names, placed, views, strict=True)
+        ],
+    }
+
+
+def _intrinsics(camera: Camera, origin: tuple[int, int]) -> dict[str, float]:
+    """Return focal lengths, principal point and distortion of a camera without zoom, as a file states them."""
+    lens, (x, y) = camera.lens or Lens(), camera.axis
+    return {
         "fl_x": camera.focal_pixels * lens.aspect,
         "fl_y": camera.focal_pixels,
         "cx": x - origin[1],
@@ -141,11 +178,6 @@ def camera_path(
         **{key: float(term) for key, term in (("k3", lens.k3), ("k4", lens.k4)) if term},
         "p1": float(lens.p1),
         "p2": float(lens.p2),
-        "frame_rate": float(frame_rate),
-        "frames": [
-            {"file_path": name, "transform_matrix": (pose + 0.0).tolist()}
-            for name, pose in zip(names, placed, strict=True)
-        ],
     }
 
 
@@ -200,15 +232,11 @@ def _pose(frame: dict[str, Any], scale: float) -> Array:
     return UPRIGHT @ matrix @ FLIP
 
 
-def _common(frames: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what every frame states alike of its lens."""
-    return {key: frames[0][key] for key in _KEYS if frames[0].get(key) is not None and not _differs(frames, key)}
-
-
-def _differs(frames: list[dict[str, Any]], key: str) -> bool:
-    """Return whether some frames state another value of a key, or none, where others state one."""
-    values = [frame.get(key) for frame in frames]
-    return any(value != values[0] for value in values)
+def _view(content: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+    """Return the lens of a frame: what it states, else what the file states; all focal lengths are of one of them."""
+    own = {key: frame[key] for key in _KEYS if frame.get(key) is not None}
+    below = {key: value for key, value in content.items() if not (_FOCAL & own.keys() and key in _FOCAL)}
+    return below | own
 
 
 def _seen_from(found: dict[str, Any], where: str, like: Camera, pose: Array, sized: bool) -> Camera:
@@ -235,13 +263,14 @@ def _seen_from(found: dict[str, Any], where: str, like: Camera, pose: Array, siz
             up=vector(-pose[:3, 1]),
             focus_distance=ahead,
             motion=None,
+            zoom=None,
             lens=bent,
         )
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 
 
-def _check_lens(content: dict[str, Any], frames: list[dict[str, Any]], found: dict[str, Any], where: str) -> None:
+def _check_lens(found: dict[str, Any], differing: list[str], where: str) -> None:
     """Raise one `ValueError` that names everything of a file that no camera here can follow, and what to do."""
     stated = {key: found[key] for key in _KEYS if found.get(key) is not None}
     blocking = []
@@ -250,9 +279,8 @@ def _check_lens(content: dict[str, Any], frames: list[dict[str, Any]], found: di
         blocking.append(f"camera_model is {model!r:.40} (read are {', '.join(MODELS)})")
     blocking += [f"{key} is true (only perspective lenses are read)" for key in OTHER_LENSES if stated.get(key)]
     blocking += [f"{key} is {stated[key]:g} (modelled are {', '.join(TERMS)})" for key in ZERO if stated.get(key)]
-    differing = [key for key in _KEYS if _differs(frames, key)]
     if differing:
-        blocking.append(f"frames differ in {', '.join(differing)} (a path has one lens)")
+        blocking.append(f"frames differ in {', '.join(differing)} (a path has one sensor and one model)")
     if blocking:
         cures = {
             "frames differ": "split the file by cameras, or calibrate with one shared camera",

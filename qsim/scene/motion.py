@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qsim.optics.camera import Vector
+from qsim.optics.hermite import interval, slopes, value_at
 from qsim.scene.rotation import (
     ORIGIN,
     UP,
@@ -219,39 +220,22 @@ class Keyframes(Motion):
             vector(place)
 
     def pose(self, t: float) -> Array:
-        i, s, length = self._locate(t)
-        p, m = np.asarray(self.positions), self._slopes() * length
-        place = (
-            (2 * s**3 - 3 * s**2 + 1) * p[i] + (s**3 - 2 * s**2 + s) * m[i]
-            + (3 * s**2 - 2 * s**3) * p[i + 1] + (s**3 - s**2) * m[i + 1]
-        )  # fmt: skip
+        place = value_at(self.times, np.asarray(self.positions), t)
         if not self.turns:
             return pose_matrix(None, place)
+        i, s, _ = interval(self.times, t)
         start, step = self._turn(i)
         return pose_matrix(exponential(s * step) @ start, place)
 
     def velocity(self, t: float) -> tuple[Array, Array]:
         if not self.times[0] <= t <= self.times[-1]:
             return np.zeros(3), np.zeros(3)
-        i, s, length = self._locate(t)
-        p, m = np.asarray(self.positions), self._slopes() * length
+        i, s, length = interval(self.times, t)
+        p, m = np.asarray(self.positions), slopes(self.times, np.asarray(self.positions)) * length
         rate = (
             6 * (s**2 - s) * (p[i] - p[i + 1]) + (3 * s**2 - 4 * s + 1) * m[i] + (3 * s**2 - 2 * s) * m[i + 1]
         ) / length
         return rate, self._turn(i)[1] / length if self.turns else np.zeros(3)
-
-    def _locate(self, t: float) -> tuple[int, float, float]:
-        """Return the interval, the fraction 0..1 of it, and its length [s]; times outside are clipped."""
-        i = int(np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 2))
-        length = self.times[i + 1] - self.times[i]
-        return i, float(np.clip((t - self.times[i]) / length, 0.0, 1.0)), length
-
-    def _slopes(self) -> Array:
-        """Return the slope [m/s] at every key, [keys, 3]: the chord of its neighbours, one-sided at the ends."""
-        return (
-            np.gradient(np.asarray(self.positions, dtype=np.float64), axis=0, edge_order=1)
-            / (np.gradient(np.asarray(self.times, dtype=np.float64))[:, None])
-        )
 
     def _turn(self, i: int) -> tuple[Array, Array]:
         """Return the rotation at key i [3, 3], and the rotation vector [3] in world axes from it to key i + 1."""

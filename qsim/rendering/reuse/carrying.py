@@ -47,6 +47,7 @@ def unshared(scene: Scene, shutter: float, backend: str) -> str:
         "three bands": scene.bands is not None,
         "lights that flicker": bool(scene.flickers),
         "a thin lens": scene.camera.aperture_blur,
+        "a lens that zooms": scene.camera.zoom is not None,
         "a lens that distorts": lens is not None and lens.distorts,
         "the scalar engine": backend == "scalar",
     }

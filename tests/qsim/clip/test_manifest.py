@@ -4,14 +4,19 @@ import dataclasses
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tiny_clip import meta, write
 
 from qsim import files
 from qsim.clip.clip import Clip
+from qsim.clip.photons import clip_photons
 from qsim.clip.writer import ClipWriter
+from qsim.formats.exporting import camera_file
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
+from qsim.optics.radiometry import expected_photons
+from qsim.optics.zoom import Zoom
 from qsim.scene import describe
 
 
@@ -66,9 +71,32 @@ def test_a_lens_is_stored_and_read_again(tmp_path: Path):
     for i, lens in enumerate((radial, every)):
         stored = describe(dataclasses.replace(camera, lens=lens))
         assert write(tmp_path / str(i), camera=stored).camera.lens == lens
-    ideal = describe(dataclasses.replace(camera, lens=None))
-    assert "lens" not in ideal
-    assert write(tmp_path / "b", camera=ideal).camera.lens is None
+    zoom = Zoom((0.0, 0.5), (7e3, 8e3), (radial, dataclasses.replace(every, aspect=1.0)))
+    changing = write(tmp_path / "z", camera=describe(dataclasses.replace(camera, zoom=zoom))).camera
+    assert changing.zoom == zoom
+
+
+def test_each_frame_has_the_light_and_the_lens_of_its_time(tmp_path: Path):
+    """The aspect of a lens changes a pixel's area, and its fall-off with the focal length the corners."""
+    zoom = Zoom((0.0, 1e-3), (70.0, 20.0), (Lens(0.1, 0.0, (-0.2,)), Lens(0.3, 0.0, (-0.2,), aspect=2.0)))
+    camera = Camera(8e-3, 2.8, 1.1e-6, 8, 10, zoom=zoom)
+    clip = write(tmp_path / "z", camera=describe(camera))
+    each = [clip_photons(clip, t) for t in range(len(clip))]
+    for t, photons in enumerate(each):
+        seen = camera.at(t / clip.frame_rate)
+        wanted = expected_photons(clip.radiance(t), seen, clip.exposure, origin=clip.origin)
+        np.testing.assert_allclose(photons, wanted, rtol=1e-12)
+    assert clip.mean_photons == pytest.approx(np.mean(each), rel=1e-9)
+    frames = camera_file(clip)["frames"]
+    for t, frame in enumerate(frames):
+        assert frame["fl_y"] == pytest.approx(camera.at(t / clip.frame_rate).focal_pixels)
+    assert frames[0]["fl_y"] > 1.2 * frames[-1]["fl_y"]
+
+
+def test_an_ideal_lens_is_not_described():
+    camera = Camera(8e-3, 2.8, 1.1e-6, 10, 7)
+    ideal = describe(dataclasses.replace(camera, lens=Lens()))
+    assert not {"lens", "zoom"} & ideal.keys()
 
 
 def test_a_damaged_lens_is_named(tmp_path: Path):

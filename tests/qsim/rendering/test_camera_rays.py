@@ -13,6 +13,7 @@ from qsim.backend import choose
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
 from qsim.optics.radiometry import expected_photons
+from qsim.optics.zoom import Zoom
 from qsim.rendering.budget import Budget
 from qsim.rendering.camera_rays import CameraRays
 from qsim.scene import Body, Constant, Glow, Scene, Spin, Still, Translation
@@ -137,6 +138,46 @@ def test_the_truth_of_a_static_scene_is_that_of_the_distorting_camera():
         assert ((frame.body_id == 1) == (within < 0))[clear].all()
 
 
+def zooming() -> Camera:
+    """Return a wide camera that turns, and whose lens changes from frame to frame."""
+    wide, far = Lens(-0.2, 0.05, (-0.2,), (0.02, 0.0)), Lens(0.1, 0.0, (-0.2,), (-0.03, 0.05), p1=0.02, aspect=1.1)
+    zoom = Zoom((0.0, 2 / RATE, 5 / RATE), (0.9, 1.3, 1.1), (wide, far, replace(wide, k3=0.02)))
+    return replace(CAMERA, focal_length=2e-3, lens=wide, zoom=zoom, motion=Spin((0, 1, 0.3), 30.0))
+
+
+def test_rays_and_truth_follow_a_lens_that_changes():
+    camera = zooming()
+    made = renderer(plate(None, camera=camera))
+    mi = made.mi
+    y, x = np.mgrid[:24, :33] + 0.5
+    for t in (0.0, 1.3 / RATE, 4 / RATE, 9.0):
+        rays = CameraRays(mi, camera).at(t).through(np.eye(4), mi.Point2f(x.ravel(), y.ravel()), None)
+        found = np.array(rays.d).T
+        np.testing.assert_allclose(
+            found / found[:, 2:], camera.at(t).directions().reshape(-1, 3), atol=2e-6, err_msg=str(t)
+        )
+    frame = made.frame(2)
+    pose = camera.pose(2 / RATE)
+    rays = camera.at(2 / RATE).directions() @ pose[:3, :3].T
+    points = pose[:3, 3] + rays * frame.depth[..., None].astype(np.float64)
+    for later, flow in ((3 / RATE, frame.flow), (1 / RATE, frame.flow_back)):
+        pixels, _ = camera.project(points, later)
+        near = np.isfinite(frame.depth)
+        np.testing.assert_allclose(flow[:, near], [(pixels[..., 0] - x)[near], (pixels[..., 1] - y)[near]], atol=1e-4)
+    ends = np.stack([x, y]) + frame.flow
+    assert not frame.valid[~((ends >= 0).all(axis=0) & (ends[0] <= 33) & (ends[1] <= 24))].any()
+
+
+def test_a_spot_is_rendered_where_a_changing_lens_projects_it():
+    camera = zooming()
+    for t in (0, 1, 4):
+        place = camera.pose(t / RATE)[:3, :3] @ camera.at(t / RATE).directions()[9, 20] * 2.5
+        place = place + camera.pose(t / RATE)[:3, 3]
+        made = renderer(glowing(0.08, tuple(place), camera), budget=Budget(1024, 1))
+        centre, _ = moments(made.frame(t).radiance.astype(np.float64))
+        np.testing.assert_allclose(centre, (20.5, 9.5), atol=0.05)
+
+
 def test_light_behind_a_lens_falls_off_once():
     """An even scene: the photons are those of the axis, times the light of the lens at each pixel."""
     camera = replace(CAMERA, focal_length=2e-3, lens=BENT)
@@ -181,5 +222,10 @@ def test_the_scalar_engine_refuses_what_it_has_not():
         made = plate(None, camera=replace(CAMERA, lens=lens))
         with pytest.raises(ValueError, match=r"which the scalar engine .* has no distortion and no shift"):
             renderer(made, engine=choose("scalar")).frame(0)
+    with pytest.raises(ValueError, match=r"Camera.zoom: Mitsuba's own camera, .* has no distortion and no zoom"):
+        renderer(
+            plate(None, camera=replace(CAMERA, zoom=Zoom((0.0, 1.0), (3.0, 4.0), (Lens(), Lens())))),
+            engine=choose("scalar"),
+        ).frame(0)
     falling = plate(None, camera=replace(CAMERA, lens=Lens(falloff=(-0.3,))))
     assert renderer(falling, engine=choose("scalar")).frame(0).radiance.any()
