@@ -17,7 +17,7 @@ from pkgutil import walk_packages
 from types import ModuleType
 from typing import Any
 
-from qsim.documented_keys import fields_of
+from qsim.cli.documented_keys import fields_of
 
 PACKAGES = ("qsim", "quiver")
 

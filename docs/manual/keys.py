@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 
-from qsim.documented_keys import Key, keys
+from qsim.cli.documented_keys import Key, keys
 
 _MARK = re.compile(r"^<!-- keys: (\[\S+\]) -->$", re.MULTILINE)
 

@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from qsim import checks, documented_keys, files
+from qsim import checks, files
+from qsim.cli import documented_keys
 from qsim.cli.console import PILOT, RESUMES, bar, command, note, output
 from qsim.cli.options import checked, part_of
 from qsim.dataset.job import Job, Settings

@@ -29,6 +29,7 @@ from quiver.cli.options import (
 )
 from quiver.device import DEVICES
 from quiver.restoration.interface import NETWORKS, QUIVERS
+from quiver.training.saving import WHEN
 
 # train
 
@@ -48,7 +49,7 @@ def add_train(sub: Any) -> None:
         nargs="+",
         help="data set folder, or several, whose clips count alike; for bit2bit a stored stream, or a clip with one",
     )
-    parser.add_argument("-o", "--output", required=True, help="folder of the run")
+    parser.add_argument("-o", "--output", required=True, help=f"folder of the run; its state is {WHEN}")
     add_preset(parser, "mergenet", NETWORKS)
     parser.add_argument(
         "--protocol",

@@ -36,6 +36,7 @@ from quiver.evaluation import metrics
 from quiver.training.optimiser import Optimiser
 from quiver.training.processes import Process, begin_worker, joined, plain_errors
 from quiver.training.run_folder import Run
+from quiver.training.saving import CHECKPOINT_SECONDS, first_line
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
 from quiver.training.self_supervised import make_stream_windows
 from quiver.training.settings import Settings, settled
@@ -43,7 +44,6 @@ from quiver.training.system import Batch, Objective, System
 from quiver.training.systems import OURS, system_of
 
 AnyWindows = Windows | StreamWindows
-CHECKPOINT_SECONDS = 120.0
 FOREVER = 10**9  # steps of a run that only time limits
 VALIDATION_SIDE = 128  # px, of the validation windows at most
 
@@ -202,6 +202,8 @@ class Trainer:
         self.started, self.saved = time.monotonic() - self.state.elapsed, time.monotonic()
         self.loss, self.rate = math.nan, math.nan  # of the last step
         self.validation = 0.0  # s, duration of the last one
+        self.validated = False
+        self.stored = run.checkpoint.exists()
 
     def step(self, batch: dict[str, Any]) -> None:
         """Update the weights by one batch; `Diverged` if its loss or gradient is not finite."""
@@ -249,6 +251,7 @@ class Trainer:
             self.board.validation(state, score, picture)
             self._record(score)
         state.halvings = int(self.process.from_leader(state.halvings))
+        self.validated = True
         self.validation = time.monotonic() - began
 
     def _record(self, score: metrics.Score) -> None:
@@ -265,10 +268,12 @@ class Trainer:
         self.run.save_history(state)
 
     def save(self, *, now: bool) -> None:
-        """Write the checkpoint if the last one is old, or `now`."""
-        if self.process.leads and (now or time.monotonic() - self.saved > CHECKPOINT_SECONDS):
+        """Write the checkpoint if the last one is old, after the first validation without any, or `now`."""
+        first = self.validated and not self.stored
+        if self.process.leads and (now or first or time.monotonic() - self.saved > CHECKPOINT_SECONDS):
             self.run.save(self.run.checkpoint, self.model, self.optimiser, self.state)
             self.saved = time.monotonic()
+            self.stored = True
 
 
 def train(
@@ -284,8 +289,9 @@ def train(
     """Train `model` in place to the end that the settings define, or until `should_stop`; return its state.
 
     A run in `settings.out` is resumed; `force` starts it again from the beginning. `note` receives lines about the
-    noise of the windows and about missing clips. ValueError and OSError for settings and folders that do not fit,
-    `Diverged` for NaN or Inf. The call sets torch's number of threads, and makes denormal numbers zero in this process.
+    noise of the windows, missing clips, and the step from which the run goes. ValueError and OSError for settings and
+    folders that do not fit, `Diverged` for NaN or Inf. The call sets torch's number of threads, and makes denormal
+    numbers zero in this process.
     """
     torch.set_flush_denormal(True)  # gradients in the tails of GELU are denormal and slow down a step
     with joined(device) as process, contextlib.ExitStack() as stack:
@@ -304,6 +310,7 @@ def train(
             windows, fixed = make_windows(settings, system.side(model), system, validated, system.window(model))
             lines += unfinished(settings.folders)
         conditions = {"processes": process.world, "computes_in": precision_of(settings, process.device)}
+        begun = not force and (Path(settings.out) / "settings.json").is_file()
         run = Run(settings, conditions | {"clips": source_digest(windows, fixed), "validated_frames": validated})
         Optimiser(model.to(process.device), settings.optimiser, settings.learning_rate, settings.betas)
         if process.leads:
@@ -314,6 +321,8 @@ def train(
         if process.leads:
             for line in lines:
                 note(line)
+            state = trainer.state
+            note(first_line(state.step, steps=settings.steps, begun=begun, finished=state.finished))
             trainer.board = Board(run.folder, settings, trainer.state, progress)
             stack.callback(trainer.board.close)
         for batch in batches(windows, settings, trainer.state, process):

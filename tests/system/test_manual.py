@@ -15,7 +15,7 @@ import pytest
 
 import qsim.cli.program
 import quiver.cli.program
-from qsim import documented_keys
+from qsim.cli import documented_keys
 from qsim.cli.console import options_of
 
 pytest.importorskip("sphinx")

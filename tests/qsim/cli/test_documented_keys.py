@@ -5,7 +5,7 @@ from dataclasses import fields
 
 import pytest
 
-from qsim import documented_keys
+from qsim.cli import documented_keys
 from qsim.cli.program import main
 from qsim.dataset import recipe
 from qsim.dataset.recipe_sections import scenes_section, streams_section

@@ -82,7 +82,7 @@ def test_a_run_records_its_whole_mixture_and_keeps_it(data, tmp_path):
         ("spad-320x240", 1, 10.0),
     ]
     assert all("dark_map" in n["defects"] for n in written["noise"])
-    assert said == ["noise: spad-320x240, 1 bit, 1 and 10 PPP, dark-count map"]
+    assert said[:-1] == ["noise: spad-320x240, 1 bit, 1 and 10 PPP, dark-count map"]
     for clip in open_clips(data):
         sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25))
     said.clear()

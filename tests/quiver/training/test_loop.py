@@ -74,6 +74,34 @@ def test_killed_and_resumed_equals_uninterrupted(tiny_dataset, tmp_path, monkeyp
     assert same_weights(load(tmp_path / "a/best.safetensors"), load(tmp_path / "b/best.safetensors"))
 
 
+def test_the_first_validation_saves_and_every_start_says_its_step(tiny_dataset, tmp_path):
+    """Killed at step 4 after a validation at step 3, it resumes after 3; killed before, it says why it starts at 0."""
+
+    def killed_at(step: int) -> list[str]:
+        asked, said = [], []
+
+        def kill() -> bool:
+            asked.append(1)
+            if len(asked) == step:
+                raise Killed
+            return False
+
+        with pytest.raises(Killed):
+            train(small_network(), wanted, should_stop=kill, progress=False, note=said.append)
+        return said
+
+    wanted = settings(tiny_dataset, tmp_path / "r", validate_every=3)
+    when = "saved at the first validation, then every 120 s, at the end and on Ctrl-C"
+    assert killed_at(2)[-1] == f"starts at step 0 of 6; the state is {when}"
+    again = killed_at(4)[-1]
+    assert again == f"starts again at step 0 of 6: the earlier run ended before it saved its state; the state is {when}"
+    said: list[str] = []
+    assert train(small_network(), wanted, progress=False, note=said.append).step == 6
+    assert said[-1] == f"resumes after step 3 of 6, the last saved state; the state is {when}"
+    train(small_network(), wanted, progress=False, note=said.append)
+    assert said[-1] == "the run is finished: it ended after step 6"
+
+
 def test_an_interruption_saves_its_step(tiny_dataset, tmp_path):
     steps = []
 
@@ -284,13 +312,14 @@ def test_a_run_resumes_only_with_its_clips(tmp_path):
     once = settings(data, tmp_path / "r", steps=1)
     train(small_network(), once, progress=False, note=said.append)
     lacks = f"{data}: the data set lacks 1 of its clips; a run resumes only with the clips that it began with, so"
-    assert said[1:] == [f"{lacks} finish `qsim generate` first"]
+    assert said[1:-1] == [f"{lacks} finish `qsim generate` first"]
     (tmp_path / "away.json").rename(record)
     with pytest.raises(FileExistsError, match=r"a run on other clips or codes than .* choose another -o, or start"):
         train(small_network(), once, progress=False)
     said.clear()
     train(small_network(), once, progress=False, force=True, note=said.append)
-    assert len(said) == 1
+    assert len(said) == 2
+    assert said[1].startswith("starts at step 0 of 1; ")
     train(small_network(), once, progress=False)
 
 
