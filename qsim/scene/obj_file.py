@@ -41,7 +41,7 @@ class _Materials:
             where = f"mesh {self.path}: mtllib"
             try:
                 file = file_beside(self.path, where, name)
-                text = regular_bytes(file, where).decode("utf-8", "replace")
+                text = _text(regular_bytes(file, where))
             except (OSError, ValueError) as error:
                 self.problem = error
                 continue
@@ -127,7 +127,7 @@ def obj_pieces(path: Path) -> list[Piece]:
 
     `ValueError` with file and line for faces that name no vertex, and for materials that no .mtl file has.
     """
-    text = regular_bytes(path, f"mesh {path}").decode("utf-8", "replace")
+    text = _text(regular_bytes(path, f"mesh {path}"))
     vertices: list[tuple[float, ...]] = []
     coordinates: list[tuple[float, ...]] = []
     materials, current = _Materials(path), ""
@@ -195,6 +195,14 @@ def _corner(where: str, word: str, vertices: int, coordinates: int) -> tuple[int
             raise ValueError(f"{where}: {what} {index} does not exist; {count} stand before this line")
         found.append(place)
     return found[0], found[1]
+
+
+def _text(raw: bytes) -> str:
+    """Return a text in UTF-8, or in Latin-1, which older programs write."""
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")
 
 
 def _lines(text: str) -> Iterator[tuple[int, list[str]]]:

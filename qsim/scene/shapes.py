@@ -244,7 +244,7 @@ def _pieces(path: Path) -> list[Piece] | None:
         raise FileNotFoundError(f"mesh {path}: no such file")
     if path.suffix.lower() in GLTF_SUFFIXES:
         return still_pieces(path)
-    if path.suffix.lower() == ".obj" and re.search(rb"(?m)^\s*(vt|mtllib)\s", path.read_bytes()):
+    if path.suffix.lower() == ".obj" and re.search(rb"(?m)^(\xef\xbb\xbf)?\s*(vt|mtllib)\s", path.read_bytes()):
         return obj_pieces(path)
     return None
 

@@ -262,6 +262,16 @@ def test_a_file_of_two_materials_is_one_body_of_patches(tmp_path):
         Body("part", type(mesh)(mesh.vertices, mesh.faces[:1], mesh.uv), material)
 
 
+def test_texts_of_older_and_of_other_programs_are_read(tmp_path):
+    """A mark of UTF-8 and ends of lines as on Windows; names in Latin-1."""
+    path = write_obj(tmp_path, OBJ, MTL)
+    wanted = mesh_material(path).materials[0].reflectance.colours()
+    path.write_bytes(b"\xef\xbb\xbf" + OBJ.replace("\n", "\r\n").encode())
+    (tmp_path / "two.mtl").write_bytes(MTL.replace("picture.png", "bäd name.png").encode("latin-1"))
+    (tmp_path / "picture.png").rename(tmp_path / "bäd name.png")
+    np.testing.assert_array_equal(mesh_material(path).materials[0].reflectance.colours(), wanted)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
