@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from qsim.optics.diffraction import diffract
     from qsim.optics.lens import Lens
     from qsim.optics.radiometry import RGB, WHITE_PER_MEAN, LightLevel, band_photons, expected_photons, photons_per_lux
+    from qsim.optics.zoom import Zoom
 
 __all__ = [
     "RGB",
@@ -16,6 +17,7 @@ __all__ = [
     "Camera",
     "Lens",
     "LightLevel",
+    "Zoom",
     "band_photons",
     "diffract",
     "expected_photons",
@@ -30,6 +32,7 @@ __getattr__ = lazy_names(
         "LightLevel": "radiometry",
         "RGB": "radiometry",
         "WHITE_PER_MEAN": "radiometry",
+        "Zoom": "zoom",
         "band_photons": "radiometry",
         "diffract": "diffraction",
         "expected_photons": "radiometry",

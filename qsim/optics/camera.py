@@ -35,7 +35,7 @@ def checked_pitch(pitch: float, where: str) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Lens, pixels, position and orientation of the camera."""
+    """Lens, pixels, position and orientation of the camera. With a `zoom`, `at` gives the camera of any time."""
 
     focal_length: float  # m
     f_number: float  # focal length / entrance pupil diameter
@@ -53,8 +53,7 @@ class Camera:
     aperture_blur: bool = False  # thin lens of diameter focal_length / f_number instead of a pinhole
     focus_distance: float | None = None  # m; None: distance from origin to target
     lens: Lens | None = field(default=None, metadata={"described": "if any"})  # distortion, fall-off; None: ideal
-    # A view that changes; `focal_length` and `lens` are then those of a moment, and `at` gives those of any
-    zoom: Zoom | None = field(default=None, metadata={"described": "if any"})
+    zoom: Zoom | None = field(default=None, metadata={"described": "if any"})  # replaces focal_length, lens over time
 
     def __post_init__(self) -> None:
         checked_pitch(self.pixel_pitch, "Camera.pixel_pitch")
