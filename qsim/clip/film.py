@@ -40,9 +40,9 @@ class Film:
         if not 0 < fps <= 50:
             raise ValueError(f"{name}: a film shows above 0 and at most 50 frames per second, got {fps!r}")
         values = frames[start:last]
-        white = colour.peak(values)
-        caption = f"{name}, frames {start}..{last - 1} of {len(frames)}, white = {white:.4g}"
-        return cls(colour.tone_picture(values, white, colours=values.ndim == 4), caption, fps)
+        brightest = colour.peak(values)
+        caption = f"{name}, frames {start}..{last - 1} of {len(frames)}, brightest shown = {brightest:.4g}"
+        return cls(colour.tone_picture(values, brightest, colours=values.ndim == 4), caption, fps)
 
     def __repr__(self) -> str:
         return f"<Film of {self.caption}; shown by notebooks, `qsim preview` writes files>"

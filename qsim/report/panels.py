@@ -136,7 +136,7 @@ def stream_panels(stream: Stream, frames: range, truth: Photons | None = None) -
     after = f"; {left}" if left else ""
     behind = filters if picture.ndim == 3 else None  # a demosaiced picture is no mosaic
     brightest = float(one(np.array([2.0**stream.bits - 1]))[0])
-    own = f"; white: {brightest:.3g} photons" if brightest < 0.9 * white else ""  # less is not seen
+    own = f"; brightest shown: {brightest:.3g} photons" if brightest < 0.9 * white else ""  # less is not seen
     return [
         page.Panel(
             names[0] + own + after, fit(colour.tone(light, min(white, brightest)), filters), score(light, mosaic)

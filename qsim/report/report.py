@@ -212,7 +212,7 @@ def restored_section(path: Path) -> page.Section:
             overlays, largest, _ = truth_panels(clip, frames)
             panels += overlays[1:]  # the first is the light again
             wheel = legend(largest)
-    lines.append(f"White of the pictures: {white:.3g} photons.")
+    lines.append(f"Brightest light shown: {white:.3g} photons.")
     which = of_first(frames, len(restored))
     found = f" at {own.score} PSNR{which}" if own.score else ""
     seen = (

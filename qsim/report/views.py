@@ -2,7 +2,8 @@
 
     path -> Source -> View.picture(t), uint8 [H, W, 3]
 
-One white and one colour scale apply to all frames (measured on at most SAMPLES of them), so frames can be compared.
+One brightest value and one colour scale apply to all frames (measured on at most SAMPLES of them), so that frames can
+be compared.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from qsim.sensor.demosaicing import demosaic, determines_bands
 Picture = NDArray[np.uint8]  # [H, W, 3]
 SAMPLES = 16  # frames on which the scales of a clip are measured
 KINDS = ("sharp", "radiance", "codes", "average", "flow", "depth")  # the values of --what
-CURVE = f"(value / white)^(1/{colour.GAMMA:g})"
+CURVE = f"(value / brightest shown)^(1/{colour.GAMMA:g})"
 
 
 @dataclass(frozen=True)
@@ -187,14 +188,16 @@ def _grey(levels: NDArray[np.uint8]) -> Picture:
 
 
 def _light_view(kind: str, title: str, unit: str, length: int, read: Callable[[int], NDArray[Any]]) -> View:
-    white = colour.peak(np.stack([read(t) for t in _samples(length)]))
-    declared = f"{title}: white = {white:.4g} {unit}, curve {CURVE}"
-    return View(kind, declared, lambda t: _toned(read(t), white), None, {"white": white})
+    brightest = colour.peak(np.stack([read(t) for t in _samples(length)]))
+    declared = f"{title}: brightest shown = {brightest:.4g} {unit}, curve {CURVE}"
+    return View(kind, declared, lambda t: _toned(read(t), brightest), None, {"brightest_shown": brightest})
 
 
-def _toned(light: NDArray[Any], white: float) -> Picture:
+def _toned(light: NDArray[Any], brightest: float) -> Picture:
     """Return light, [H, W] or the bands [3, H, W], as a picture."""
-    return _grey(colour.tone(light, white)) if light.ndim == 2 else colour.tone_picture(light, white, colours=True)
+    return (
+        _grey(colour.tone(light, brightest)) if light.ndim == 2 else colour.tone_picture(light, brightest, colours=True)
+    )
 
 
 def _code_views(
@@ -215,13 +218,13 @@ def _code_views(
     def code(t: int) -> Picture:
         return _grey(colour.code_levels(read(t, t + 1)[0], bits))
 
-    white = colour.peak(np.stack([average(t) for t in _samples(length)]))
+    brightest = colour.peak(np.stack([average(t) for t in _samples(length)]))
     shown = f"codes of {name}: 0 black, {top} white, no curve"
     after = "" if bands is None else ", demosaiced"
-    mean = f"naive mean of {colour.AVERAGE} frames{after}: white = {white * top:.4g} codes, curve {CURVE}"
+    mean = f"naive mean of {colour.AVERAGE} frames{after}: brightest shown = {brightest * top:.4g} codes, curve {CURVE}"
     return {
         "codes": View("codes", shown, code, None, {"bits": bits}),
-        "average": View("average", mean, lambda t: _toned(average(t), white), None, {"white": white}),
+        "average": View("average", mean, lambda t: _toned(average(t), brightest), None, {"brightest_shown": brightest}),
     }
 
 

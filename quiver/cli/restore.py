@@ -110,7 +110,7 @@ def _run_restore(args: argparse.Namespace) -> int:
         args,
         {"restored": str(target)} | meta,
         f"{target}: {length} frames of {size} by {method.name}, "
-        f"{meta['seconds_per_frame']:.3g} s per frame; photons, white = {codes.white:.4g}",
+        f"{meta['seconds_per_frame']:.3g} s per frame; photons, white of the sensor = {codes.white:.4g}",
     )
     return 0
 

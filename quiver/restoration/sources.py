@@ -137,6 +137,6 @@ def assumed(codes: Codes, method: Restorer) -> str:
     seen = f"{method.frames_used} frames" if method.seamless else f"all earlier and {method.look_ahead} later frames"
     return (
         f"{codes.name}: {length} frames of {height} x {width}, {codes.frame_rate:g} codes/s; "
-        f"sensor {sensor}, {codes.sensor.bits} bit{light}, white = {codes.white:.4g} photons; "
+        f"sensor {sensor}, {codes.sensor.bits} bit{light}, white of the sensor = {codes.white:.4g} photons; "
         f"method {method.name} ({method.description}), {seen} for each"
     )

@@ -111,15 +111,19 @@ function writeAddress() {
   history.replaceState(null, "", "#" + words);
 }
 
-// Pictures: grey = 255 (value / white)^(1/2.2), as in qsim.colour.tone.
+// Pictures: grey = 255 (value / brightest)^(1/2.2), as in qsim.colour.tone.
 
-function percentile(values, share) { return Float64Array.from(values).sort()[Math.round(share * (values.length - 1))]; }
+// As numpy.percentile: linear between the two nearest values.
+function percentile(values, share) {
+  const sorted = Float64Array.from(values).sort(), place = share * (sorted.length - 1), low = Math.floor(place);
+  return sorted[low] + (place - low) * (sorted[Math.min(low + 1, sorted.length - 1)] - sorted[low]);
+}
 
-function paint(id, values, white) {
+function paint(id, values, brightest) {
   const canvas = at(id), image = new ImageData(data.width, data.height);
   canvas.width = data.width; canvas.height = data.height;
   for (let i = 0; i < pixels; i++) {
-    const grey = 255 * Math.min(values[i] / white, 1) ** (1 / 2.2);
+    const grey = 255 * Math.min(values[i] / brightest, 1) ** (1 / 2.2);
     image.data.set([grey, grey, grey, 255], 4 * i);
   }
   canvas.getContext("2d").putImageData(image, 0, 0);
@@ -197,12 +201,12 @@ function update() {
 
 function showPictures(first, photons, codes, light) {
   const middle = photonsOf(first + Math.floor((state.frames - 1) / 2), 1);
-  const bright = percentile(photons, 0.999) || 1, white = Math.min(bright, light[light.length - 1]) || 1;
+  const bright = percentile(photons, 0.999) || 1, brightest = Math.min(bright, light[light.length - 1]) || 1;
   paint("instant", middle, percentile(middle, 0.999) || 1);
   paint("exposed", photons, bright);
-  paint("codes", Float64Array.from(codes, code => light[code]), white);
+  paint("codes", Float64Array.from(codes, code => light[code]), brightest);
   at("exposed-caption").textContent = state.frames > 1 ? `, mean of ${state.frames} frames` : "";
-  at("codes-caption").textContent = `, ${state.bits} bit, each as its light; white: ${short(white)} photons or code ${light.length - 1}`;
+  at("codes-caption").textContent = `, ${state.bits} bit, each as its light; brightest shown: ${short(brightest)} photons or code ${light.length - 1}`;
 }
 
 function showNumbers(own, counts, expected, mean, here) {

@@ -29,7 +29,7 @@ def test_a_film_holds_the_frames_with_the_tone_curve_of_all_pictures():
     array = np.random.default_rng(0).random((5, 8, 11)).astype(np.float32)
     film = Film.of("fan", frames_of(array), 1, 4, 10.0)
     white = colour.peak(array[1:4])
-    assert film.caption == f"fan, frames 1..3 of 5, white = {white:.4g}"
+    assert film.caption == f"fan, frames 1..3 of 5, brightest shown = {white:.4g}"
     found = decoded(film._repr_html_())
     assert len(found) == 3
     np.testing.assert_array_equal(np.stack(found), colour.tone(array[1:4], white))

@@ -14,6 +14,7 @@ from clips import sliding_pattern, write_clip
 from javascript import TEMPLATES, MiniRacer, Script
 from stats import critical_z, mixture_p_value, per_check
 
+from qsim import colour
 from qsim.cli.program import main
 from qsim.clip.photons import clip_photons
 from qsim.report import explore
@@ -140,6 +141,12 @@ def test_named_sensors_are_those_that_the_sliders_can_state():
     assert "quiver-physical" in names
     assert "spcm20a" in names
     assert "cmos-5.1e" not in names, "10 bits and an offset"
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 999, 1001, 5000])
+def test_pages_and_pictures_have_one_brightest_value(controls, count):
+    light = np.random.default_rng(count).gamma(1.0, 3.0, count)
+    assert controls.value(f"percentile({light.tolist()}, 0.999)") == pytest.approx(colour.peak(light), rel=1e-12)
 
 
 def test_a_named_sensor_keeps_its_name_only_at_the_light_of_its_gain(controls):

@@ -26,7 +26,7 @@ def test_png_holds_picture_legend_and_declaration(clip, tmp_path, capsys):
     )
     out = capsys.readouterr().out
     assert "frame 1 of odd" in out
-    assert "curve (value / white)^(1/2.2)" in out
+    assert "curve (value / brightest shown)^(1/2.2)" in out
     image = Image.open(target)
     pixels = np.asarray(image)
     assert pixels.shape[0] % 2 == pixels.shape[1] % 2 == 0

@@ -17,20 +17,20 @@ from qsim.sensor.qis import QIS
 def test_views_are_the_declared_functions_of_the_numbers(clip):
     views = open_source(clip.path).views
     assert list(views) == ["sharp", "codes", "average", "flow", "depth"]
-    white = views["sharp"].scale["white"]
+    white = views["sharp"].scale["brightest_shown"]
     assert white == pictures.peak(np.stack([clip.sharp(t) for t in range(5)]))
     assert np.array_equal(views["sharp"].picture(2)[..., 1], pictures.tone(clip.sharp(2), white))
     assert np.array_equal(views["codes"].picture(2)[..., 0], np.rint(clip.stream("mine").codes(2, 3)[0] * 255.0 / 7))
     assert views["flow"].picture(1)[3, 3].tolist() == [255, 0, 0], "to the right at full speed"
     assert "2 px/frame" in views["flow"].declared
     assert views["depth"].picture(1)[-1].max() == 0
-    assert f"white = {white:.4g} relative" in views["sharp"].declared
+    assert f"brightest shown = {white:.4g} relative" in views["sharp"].declared
 
 
 def test_average_is_of_the_frames_around(clip):
     view = open_source(clip.path).views["average"]
     mean = clip.stream("mine").codes().mean(axis=0) / 7  # five frames: every window of eleven holds all of them
-    assert np.array_equal(view.picture(0)[..., 0], pictures.tone(mean, view.scale["white"]))
+    assert np.array_equal(view.picture(0)[..., 0], pictures.tone(mean, view.scale["brightest_shown"]))
 
 
 def test_restored_video_names_its_method(tmp_path):
@@ -38,7 +38,7 @@ def test_restored_video_names_its_method(tmp_path):
     described = {"format": "quiver-restored-1", "method": "moment", "unit": "photons", "frame_rate": 2000.0}
     files.write_description(tmp_path / "video.json", described)
     view = open_source(tmp_path / "video.npy").views["values"]
-    assert view.declared.startswith("restored by moment: white = 6.5 photons")
+    assert view.declared.startswith("restored by moment: brightest shown = 6.5 photons")
     assert (view.picture(0) == 255).all()
 
 
@@ -76,7 +76,7 @@ def test_codes_of_several_clip_frames_stand_beside_the_light_of_their_exposure(t
     assert (len(stream), source.length) == (3, 21)
     assert slow_codes(source, stream) == [0] * 7 + [1] * 7 + [2] * 7
     assert source.views["codes"].declared.endswith("; each over 7 frames of the clip")
-    white = source.views["sharp"].scale["white"]
+    white = source.views["sharp"].scale["brightest_shown"]
     assert np.array_equal(source.views["sharp"].picture(20)[..., 1], pictures.tone(clip.sharp(20), white))
     assert slow_codes(open_source(stream.path), stream) == [0, 1, 2], "a stream alone is shown code by code"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +14,9 @@ import torch
 from golden import published_state
 from safetensors.torch import save_file
 
-from qsim import files
+from qsim import colour, files
 from qsim.cli.options import memory_size
+from qsim.cli.program import main as qsim_main
 from qsim.locks import Lock
 from quiver.cli.program import main
 from quiver.data.clips import open_clips
@@ -91,6 +93,20 @@ def test_a_stored_stream_by_clip_by_name_and_by_file(capsys, make_clip, tmp_path
         assert run(capsys, "restore", *way, "-o", path, "--method", "moment")[0] == 0
         results.append(np.load(path))
     assert all(np.array_equal(results[0], result) for result in results[1:])
+
+
+def test_a_stream_has_one_white(capsys, tmp_path, make_clip):
+    """Restoring names that of the sensor; pictures name the brightest light that they show."""
+    clip = make_clip()
+    stream = clip.sense("quiver-physical", bits=3, ppp=3.25)
+    _, out, err = run(capsys, "restore", clip.path, "-o", tmp_path / "r.npy", "--method", "moment")
+    white = stream.sensor.white(stream.exposure)
+    assert re.findall(r" white(.*?) = ([0-9.]+)", out + err) == 2 * [(" of the sensor", f"{white:.4g}")]
+    assert qsim_main(["preview", str(tmp_path / "r.npy"), "-o", str(tmp_path / "r.png")]) == 0
+    shown = capsys.readouterr().out
+    assert " white" not in shown
+    brightest = colour.peak(np.load(tmp_path / "r.npy"))
+    assert f"brightest shown = {brightest:.4g} photons" in shown
 
 
 def test_a_photon_cube(capsys, tmp_path):

@@ -141,7 +141,7 @@ def test_two_lines_say_what_was_chosen_and_assumed(inputs, tmp_path, capsys):
     assert chosen.startswith(f"auto: {method}; measured at quiver-physical, 3 bit, 3.25 PPP")
     for part in (
         "quiver-physical, 3 bit, 3.25 photons",
-        "white = 8.75",
+        "white of the sensor = 8.75 photons",
         "4 frames",
         f"method {method}",
     ):
