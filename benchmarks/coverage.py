@@ -112,12 +112,12 @@ def main(sensors: int) -> None:
     stored = ROOT / "out" / "coverage.json"
     stored.parent.mkdir(exist_ok=True)
     rows: dict[str, list[dict[str, bool]]] = json.loads(stored.read_text()) if stored.exists() else {}
-    for band in BANDS:
-        name = f"{band[0]:g} to {band[1]:g}"
-        row = rows.setdefault(name, [])
-        for hits in measured(band, range(len(row), sensors)):
-            row.append(hits)
-            stored.write_text(json.dumps(rows))
+    for number in range(sensors):
+        for band in BANDS:
+            row = rows.setdefault(f"{band[0]:g} to {band[1]:g}", [])
+            if len(row) == number:
+                row += measured(band, [number])
+                stored.write_text(json.dumps(rows))
     path = ROOT / "docs" / "results" / "coverage.md"
     path.write_text(page({name: row[:sensors] for name, row in rows.items()}))
     print(path)

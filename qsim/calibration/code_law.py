@@ -18,6 +18,7 @@ from numpy import ndarray as Array
 from qsim.calibration.prnu import normal_nodes
 
 REACH = 8.5  # standard deviations of the sum over electrons: 1e-17 is left out
+MOST = 1000.0  # e-; brighter rows take the series, however it is asked for
 FLOOR = 1e-6  # share of codes that no model describes, spread over all bins
 NODES, WEIGHTS = normal_nodes(7)
 NARROW = 0.25  # of the variance in time: a smaller spread is averaged over three points
@@ -46,8 +47,14 @@ def code_law(
     """
     at = (edges + 0.5 - offset) / gain
     spread = np.maximum(spread, LEAST * (mean + noise**2))
-    cdf = _edgeworth(at, noise, mean, spread) if smooth else _summed(at, noise, mean, spread)
-    below, by_at, by_noise, by_mean, by_spread = cdf
+    series = np.full(len(mean), smooth) | (mean > MOST)
+    if series.all() or not series.any():
+        found = _edgeworth(at, noise, mean, spread) if series.any() else _summed(at, noise, mean, spread)
+    else:
+        found = np.empty((5, len(mean), len(at)))
+        found[:, series] = _edgeworth(at, noise, mean[series], spread[series])
+        found[:, ~series] = _summed(at, noise, mean[~series], spread[~series])
+    below, by_at, by_noise, by_mean, by_spread = found
     shares = np.maximum(_bins(below, 1.0), 0.0)
     return Law(
         (1 - FLOOR) * shares + FLOOR / shares.shape[1],
@@ -64,8 +71,8 @@ def _bins(cdf: Array, top: float) -> Array:
     return np.diff(cdf, axis=1, prepend=0.0, append=top)
 
 
-def _summed(at: Array, noise: float, mean: Array, spread: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the cdf [R, B - 1] at electrons `at`, and its derivatives by `at`, noise, mean and spread."""
+def _summed(at: Array, noise: float, mean: Array, spread: Array) -> Array:
+    """Return the cdf at electrons `at`, and its derivatives by `at`, noise, mean and spread: [5, R, B - 1]."""
     from scipy.special import ndtr
 
     wide = REACH * np.sqrt(mean + np.maximum(spread, 0)) + 10
@@ -75,7 +82,8 @@ def _summed(at: Array, noise: float, mean: Array, spread: Array) -> tuple[Array,
     if len(electrons) <= 2 * window:
         z = (at - electrons[:, None]) / noise
         phi, density = ndtr(z), np.exp(-0.5 * z * z) / (sqrt(2 * pi) * noise)
-        return weights @ phi, weights @ density, -(weights @ (z * density)), by_mean @ phi, by_spread @ phi
+        by_noise = -(weights @ (z * density))
+        return np.stack([weights @ phi, weights @ density, by_noise, by_mean @ phi, by_spread @ phi])
     # few electrons lie near a threshold; of those below it only the total counts
     first = np.clip(np.floor(at - REACH * noise - electrons[0]), 0, len(electrons) - window).astype(int)
     near = first[:, None] + np.arange(window)
@@ -89,7 +97,7 @@ def _summed(at: Array, noise: float, mean: Array, spread: Array) -> tuple[Array,
     nearby = weights[:, near]
     by_at = np.einsum("rbw,bw->rb", nearby, density)
     by_noise = -np.einsum("rbw,bw->rb", nearby, z * density)
-    return below(weights), by_at, by_noise, below(by_mean), below(by_spread)
+    return np.stack([below(weights), by_at, by_noise, below(by_mean), below(by_spread)])
 
 
 def _electrons(electrons: Array, noise: float, mean: Array, spread: Array) -> tuple[Array, Array, Array]:
@@ -124,7 +132,7 @@ def _electrons(electrons: Array, noise: float, mean: Array, spread: Array) -> tu
     return total, by_mean, by_share
 
 
-def _edgeworth(at: Array, noise: float, mean: Array, spread: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _edgeworth(at: Array, noise: float, mean: Array, spread: Array) -> Array:
     """Return the same as `_summed` by an Edgeworth series with skewness and kurtosis of the Poisson part."""
 
     def cdf(shift: Array | float, variance: Array) -> Array:
@@ -143,4 +151,4 @@ def _edgeworth(at: Array, noise: float, mean: Array, spread: Array) -> tuple[Arr
     by_variance = 1e-4 * variance
     slope = (cdf(by_shift, variance) - cdf(-by_shift, variance)) / (2 * by_shift[:, None])
     wider = (cdf(0.0, variance + by_variance) - cdf(0.0, variance - by_variance)) / (2 * by_variance[:, None])
-    return cdf(0.0, variance), -slope, 2 * noise * wider, slope + wider, wider
+    return np.stack([cdf(0.0, variance), -slope, 2 * noise * wider, slope + wider, wider])

@@ -27,7 +27,10 @@ SHARED = 4  # parameters before those of the cells
 FINEST = 2.0  # bins in one standard deviation of the read noise
 MOST_BINS = 800
 STARTS = 10  # that are followed
-APART = 0.4  # e- of the brightest cell of which the histogram is used; starts differ by more
+ROUGH = 20.0  # of the log likelihood, by which a rough maximum may be worse and is followed
+NEARLY = 5.0  # by which a maximum may be worse and is another possible answer
+APART = 0.1  # of the quadratic form of the information, between two maxima
+BESIDE = (-2, -1, 1, 2)  # e- of the brightest cell whose histogram is used, by which a gain is tried beside the best
 LEAST_NOISE = 0.05  # codes; less read noise changes no histogram
 
 
@@ -128,10 +131,18 @@ class Likelihood:
             for panel in self.panels
         )
 
-    def brightest(self, parameters: Array) -> float:
-        """Return the most electrons of a cell of which the histogram is used."""
+    def beside(self, parameters: Array) -> list[Array]:
+        """Return parameters of other gains, at which the brightest cell has some whole electrons more or less."""
         electrons = self.means(parameters)
-        return max((float(electrons[list(panel.cells)].max()) for panel in self.panels), default=0.0)
+        most = max((float(electrons[list(panel.cells)].max()) for panel in self.panels), default=0.0)
+        found = []
+        for change in BESIDE:
+            factor = 1 + change / max(most, 4.0)
+            other = parameters.copy()
+            other[GAIN] -= log(factor)
+            other[SHARED:] *= factor
+            found.append(other)
+        return found
 
     def value(self, parameters: Array) -> float:
         """Return the log likelihood."""
@@ -309,6 +320,7 @@ class Fit:
     state: State
     inverse: Array  # [m, m], inverse information
     covariance: Array  # [m, m], sandwich
+    modes: tuple[State, ...]  # other maxima of nearly the same likelihood
 
     @property
     def gain(self) -> float:
@@ -323,24 +335,45 @@ def fit_cells(cells: Sequence[Cell], exposures: Sequence[float], darks: int, bit
     """Fit all cells, from the likeliest of several starts; `exposures` of the stacks, darks first."""
     longest = max(exposures[:darks])
     share = np.array([exposures[cell.stack] / longest for cell in cells])
-    starts = starts_of(cells, share, darks)
+    starts = starts_of(cells, share, darks, _brightest(cells, darks, bits))
     first = starts.points[0].copy()
     first[NOISE] = log(starts.noise)
     likelihood = Likelihood(cells, exposures, darks, bits, first)
     values = [likelihood.value(likelihood.inside(point)) for point in starts.points]
-    chosen = distinct(starts.points, values, STARTS, APART / max(likelihood.brightest(first), 1.0))
-    rough = [likelihood.maximise(point, rounds=12, enough=0.1) for point in chosen]
+    rough = [likelihood.maximise(point, rounds=12, enough=0.1) for point in distinct(starts.points, values, STARTS)]
     best = max(rough, key=lambda state: state.value)
+    beside = [likelihood.maximise(point, rounds=12, enough=0.1) for point in likelihood.beside(best.parameters)]
+    best = max([best, *beside], key=lambda state: state.value)
     likelihood.set_response(best)
     best = likelihood.maximise(best.parameters)
     likelihood = Likelihood(cells, exposures, darks, bits, best.parameters)
-    return refined(likelihood, best)
+    return refined(likelihood, best, [*rough, *beside])
 
 
-def refined(likelihood: Likelihood, start: State) -> Fit:
-    """Return the fit at the maximum near a state."""
+def _brightest(cells: Sequence[Cell], darks: int, bits: int) -> float:
+    """Return the most codes above the dark level of a cell whose histogram is used."""
+    gain = first_gain(cells)
+    used = [cell.mean for cell in cells if cell.stack >= darks and not by_moments(cell, gain, bits)]
+    return max(used, default=0.0) - min(cell.mean for cell in cells)
+
+
+def refined(likelihood: Likelihood, start: State, others: Sequence[State] = ()) -> Fit:
+    """Return the fit at the maximum near a state, with those of the other states that are nearly as likely."""
     best = start
     for _ in range(2):
         likelihood.set_response(likelihood.at(best.parameters))
         best = likelihood.maximise(best.parameters, enough=1e-10)
-    return Fit(likelihood, best, *likelihood.covariance(best))
+    modes: list[State] = []
+    for other in others:
+        if likelihood.value(other.parameters) < best.value - ROUGH:
+            continue
+        state = likelihood.maximise(other.parameters, enough=1e-5)
+        if state.value > best.value - NEARLY and all(_differ(state, known) for known in (best, *modes)):
+            modes.append(state)
+    return Fit(likelihood, best, *likelihood.covariance(best), tuple(modes))
+
+
+def _differ(one: State, other: State) -> bool:
+    """Return whether two maxima are not the same one."""
+    gap = one.parameters[:SHARED] - other.parameters[:SHARED]
+    return float(gap @ one.information[:SHARED, :SHARED] @ gap) > APART

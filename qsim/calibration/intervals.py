@@ -10,18 +10,18 @@ holds the truth in 95 and not in 97.5 of 100 cases.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf, isfinite, log, sqrt
+from math import inf, isfinite, sqrt
 
 from numpy import ndarray as Array
 
-from qsim.calibration.histogram_fit import GAIN, NOISE, OFFSET, Fit, State
+from qsim.calibration.histogram_fit import Fit, State
 from qsim.calibration.results import Z95
 
 ONE_SIDED = 1.645  # root of the one-sided limit, at the bound
 RISE = 0.18  # of the limit of the root per standard deviation from the bound, until it is Z95
 CLOSE = 0.03  # to which the root is met, relative
 SHARP = 0.5  # codes of read noise; below, the likelihood has several maxima
-TRIED = (0.1, 0.3)  # codes of read noise, or of the offset from -0.2
+WIDEST = 10.0  # most variance between pixels, relative to that of the likelihood
 HIGHER = 0.02  # of a log likelihood; less is the error of a maximum
 
 
@@ -41,7 +41,8 @@ def profile(fit: Fit, direction: Array, step: float, farthest: float, *, bound: 
     value = float(direction @ fit.state.parameters)
     variance = float(direction @ fit.covariance @ direction)
     naive = float(direction @ fit.inverse @ direction)
-    scale = min(max(variance / naive, 0.3), 10.0) if naive > 0 and variance > 0 else 1.0
+    # where the likelihood is no parabola the two differ without a reason, so the interval never gets narrower by it
+    scale = min(max(variance / naive, 1.0), WIDEST) if naive > 0 and variance > 0 else 1.0
     error = sqrt(variance) if variance > 0 and isfinite(variance) else inf
     error = min(error, step)
     search = _Search(fit, direction, scale, value, error, farthest)
@@ -58,6 +59,13 @@ def profile(fit: Fit, direction: Array, step: float, farthest: float, *, bound: 
         target = min(Z95, (ONE_SIDED + RISE * root) / (1 + RISE))
     low, first = search.end(-1, target, bound)
     high, second = search.end(1, Z95, inf)
+    for mode in fit.modes:
+        at = float(direction @ mode.parameters)
+        root = search.root_of(mode)
+        if at < low and root < target:
+            low, first = search.end(-1, target, bound, mode)
+        if at > high and root < Z95:
+            high, second = search.end(1, Z95, inf, mode)
     return Interval(value, low, high, first and second)
 
 
@@ -84,6 +92,10 @@ class _Search:
         """Return the root at a value of the parameter, above 0 on both sides."""
         state = max((self._held(start) for start in self._starts(at)), key=lambda state: state.value)
         self.last = state
+        return self.root_of(state)
+
+    def root_of(self, state: State) -> float:
+        """Return the root of a state; `HigherMaximum` if its likelihood exceeds that of the fit."""
         if state.value > self.fit.state.value + HIGHER:
             raise HigherMaximum(state)
         return sqrt(max(2 * (self.fit.state.value - state.value), 0.0) / self.scale)
@@ -94,17 +106,10 @@ class _Search:
         found = [near + self.along * (at - float(self.direction @ near))]
         if self.fit.gain * self.fit.noise > SHARP:
             return found
-        best = self.fit.state.parameters
-        for base in (near, best):
+        for state in (self.last, self.fit.state, *self.fit.modes):
+            base = state.parameters
             plain = base + self.direction * (at - float(self.direction @ base)) / float(self.direction @ self.direction)
             found.append(plain)
-        for change in TRIED:
-            other = found[-1].copy()
-            if self.direction[NOISE] == 0:
-                other[NOISE] = log(change) - other[GAIN]
-            else:
-                other[OFFSET] += change - 0.2
-            found.append(other)
         return found
 
     def _held(self, start: Array) -> State:
@@ -114,17 +119,20 @@ class _Search:
         moved = moved + self.direction * ((at - float(self.direction @ moved)) / float(self.direction @ self.direction))
         return self.fit.likelihood.maximise(moved, hold=self.direction, rounds=25, enough=2e-3)
 
-    def end(self, side: int, target: float, bound: float) -> tuple[float, bool]:
-        """Return the value where the root is `target`, and whether it lies at `target` standard errors."""
-        self.last = self.fit.state
-        near, at_near = self.value, 0.0
-        far = self.value + side * target * self.error
+    def end(self, side: int, target: float, bound: float, mode: State | None = None) -> tuple[float, bool]:
+        """Return the value where the root is `target`, and whether it lies at `target` standard errors.
+
+        The search starts at the fit, or at another maximum of the likelihood.
+        """
+        self.last = mode or self.fit.state
+        near, at_near = float(self.direction @ self.last.parameters), self.root_of(self.last)
+        far = near + side * sqrt(max(target**2 - at_near**2, 0.1)) * self.error
         if side < 0:
             far = max(far, bound)
         for count in range(20):
             found = self.root(far)
             if abs(found / target - 1) < CLOSE:
-                return self.value + (far - self.value) * target / found, count == 0
+                return near + (far - near) * (target - at_near) / (found - at_near), count == 0 and mode is None
             if found > target:
                 break
             if far == bound:

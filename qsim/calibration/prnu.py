@@ -96,7 +96,7 @@ def hot_by_level(level: Array, error: float) -> Array:
 
 def surface(shape: tuple[int, int], pixels: int) -> Array:
     """Return polynomials over the field [H * W, terms]: fourth degree, second below 100 pixels, constant below 20."""
-    degree = 4 if pixels >= 100 else 2 if pixels >= 20 else 0
+    degree = 6 if pixels >= 400 else 4 if pixels >= 100 else 2 if pixels >= 20 else 0
     y, x = (np.linspace(-1, 1, n) if n > 1 else np.zeros(1) for n in shape)
     terms = [
         np.outer(np.polynomial.legendre.legval(y, np.eye(j + 1)[j]), np.polynomial.legendre.legval(x, np.eye(i + 1)[i]))

@@ -27,9 +27,11 @@ from qsim.calibration.photon_transfer import photon_transfer
 from qsim.calibration.prnu import measure_pattern
 from qsim.calibration.quantiles import student_quantile
 from qsim.calibration.results import Z95, Calibration, Value, odd_efficiency
+from qsim.calibration.warm_pixels import hidden, without_warm
 from qsim.sensor.qis import QIS
 
 METHOD = "likelihood of the codes"
+MOST_OPEN = 2.0  # most high end over low end of the gain, for which electrons per photon are printed
 REPEATS = 5  # of a fit whose profile met a larger likelihood
 
 
@@ -45,7 +47,15 @@ def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatist
     exposures = [stack.exposure for stack in stacks]
     good = good_pixels(darks, flats)
     cells = cells_of(darks, flats, good)
-    fit, values = _fitted(cells, flats, exposures, len(darks), bits)
+    fit = fit_cells(cells, exposures, len(darks), bits)
+    used = without_warm(fit, darks, good)
+    if not np.array_equal(used, good):
+        cells = cells_of(darks, flats, used)
+        fit = fit_cells(cells, exposures, len(darks), bits)
+    fit, values = _with_intervals(fit, flats, exposures, len(darks))
+    alone = len({stack.exposure for stack in darks}) < 2
+    if alone and hidden(fit, darks):
+        values |= _without_dark_current(fit, values)
     if fit.gain * fit.noise >= LEAST_TRANSFER_NOISE:
         values |= photon_transfer(cells, exposures, len(darks), bits)
     sensor = _MeanCode(1.0, 0.0, fit.noise, bits, gain=fit.gain, offset=float(fit.state.parameters[OFFSET]))
@@ -57,6 +67,12 @@ def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatist
     warnings = _advice(darks, flats, values, fit, good)
     if p_value < 1e-3:
         warnings.append(f"the fitted histograms do not describe the data (p = {p_value:.1g}): the model is wrong here")
+    if "quantum_efficiency" in values and values["gain"].high > MOST_OPEN * values["gain"].low:
+        del values["quantum_efficiency"]
+        warnings.append(
+            f"the gain is not known within a factor of {MOST_OPEN:g}, so no efficiency is printed; use brighter "
+            "flats or more frames"
+        )
     if "quantum_efficiency" in values:
         warnings += odd_efficiency(values["quantum_efficiency"])
     return Calibration("QIS", bits, values, p_value, tuple(warnings), residuals)
@@ -109,16 +125,15 @@ def _check(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], b
         raise ValueError("calibrate: no flat is brighter than the dark frames; are --dark and --flat swapped?")
 
 
-def _fitted(
-    cells: Sequence[Cell], flats: Sequence[FrameStatistics], exposures: Sequence[float], darks: int, bits: int
+def _with_intervals(
+    fit: Fit, flats: Sequence[FrameStatistics], exposures: Sequence[float], darks: int
 ) -> tuple[Fit, dict[str, Value]]:
     """Return the fit and the values of its parameters; a larger likelihood that a profile meets starts it again."""
-    fit = fit_cells(cells, exposures, darks, bits)
     for _ in range(REPEATS):
         try:
             return fit, _parameters(fit, max(exposures[:darks])) | _efficiency(fit, flats, exposures, darks)
         except HigherMaximum as met:
-            fit = refined(fit.likelihood, met.state)
+            fit = refined(fit.likelihood, met.state, [fit.state, *fit.modes])
     raise ValueError(
         "calibrate: the likelihood has no clear maximum; take more frames, more pixels or a flat of another light"
     )
@@ -140,6 +155,26 @@ def _parameters(fit: Fit, longest: float) -> dict[str, Value]:
         "offset": Value(offset.value, offset.low, offset.high, "codes", METHOD),
         "read_noise": Value(exp(noise.value), noise_low, exp(noise.high), "e-", METHOD),
         "dark_current": Value(dark.value / longest, dark.low / longest, dark.high / longest, "e-/s", METHOD),
+    }
+
+
+def _without_dark_current(fit: Fit, values: dict[str, Value]) -> dict[str, Value]:
+    """Return offset, read noise and dark current with intervals that hold those of a camera without dark current.
+
+    One dark exposure tells dark current by the skewness of its histogram. Hot pixels that noise hides are skew, too.
+    """
+    start = fit.state.parameters.copy()
+    start[OFFSET] += fit.gain * start[DARK] * float(fit.likelihood.share.max())
+    start[NOISE] = 0.5 * log(fit.noise**2 + start[DARK])
+    start[DARK] = 0.0
+    none = fit.likelihood.maximise(start, hold=np.eye(fit.likelihood.size)[DARK])
+    offset, noise, dark = values["offset"], values["read_noise"], values["dark_current"]
+    shift = float(none.parameters[OFFSET]) - offset.value
+    factor = exp(none.parameters[NOISE]) / noise.value
+    return {
+        "offset": replace(offset, high=offset.high + max(shift, 0.0)),
+        "read_noise": replace(noise, high=noise.high * max(factor, 1.0)),
+        "dark_current": replace(dark, low=0.0),
     }
 
 

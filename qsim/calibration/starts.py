@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from math import exp, log, pi, sqrt
 
 import numpy as np
@@ -16,7 +17,8 @@ from numpy import ndarray as Array
 from qsim.calibration.cells import Cell
 from qsim.calibration.moment_law import ADC
 
-SHIFTS = (1.0, 0.97, 1.03, 0.94, 1.06, 0.9, 1.1, 0.8, 1.2, 0.65, 1.4)  # of the first gain, where no peak shows
+SHIFTS = 4  # steps of gain to either side of the first
+STEP = 0.3  # e- of the brightest cell whose histogram is used, by a step of gain
 NOISES = (0.1, 0.2, 0.3, 0.4, 0.6)  # e-
 PARTS = (0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.997)  # of the variance in the dark, by read noise
 COMB = 1.05  # codes/e-; above, the transform may show electrons
@@ -43,8 +45,11 @@ class Starts:
     hidden: bool
 
 
-def starts_of(cells: Sequence[Cell], share: Array, darks: int) -> Starts:
-    """Return the starts of a fit. `share` [cells] is the exposure of dark cells relative to the longest."""
+def starts_of(cells: Sequence[Cell], share: Array, darks: int, brightest: float) -> Starts:
+    """Return the starts of a fit. `share` [cells] is the exposure of dark cells relative to the longest.
+
+    `brightest` is the light of the brightest cell whose histogram is used, in codes.
+    """
     gain = first_gain(cells)
     peaks = electron_peaks([cell for cell in cells if cell.stack >= darks], gain)
     dark = [i for i, cell in enumerate(cells) if cell.stack < darks]
@@ -58,22 +63,22 @@ def starts_of(cells: Sequence[Cell], share: Array, darks: int) -> Starts:
         light = [max((cell.mean - offset) / gain, 1e-3) for cell in cells if cell.stack >= darks]
         points.append(np.array([log(gain), offset, log(noise), max(electrons, 1e-4), *light]))
 
-    for shift in (1.0, 0.998, 1.002):
-        if peaks is None:
-            break
-        phase = peaks.offset
-        base = cells[shortest].mean
-        at = peaks.gain * shift
-        offset = phase + at * np.floor((base - phase) / at + 0.5)
+    base = cells[shortest].mean
+    for peak, shift in product(peaks, (1.0, 0.998, 1.002)):
+        at = peak.gain * shift
+        offset = peak.offset + at * np.floor((base - peak.offset) / at + 0.5)
         for back in range(int(2 + 2 * variance / at**2 + 3 * sqrt(variance) / at)):
             electrons = max((base - offset) / at + back, 0.0) / share[shortest]
             if several:
                 electrons = (cells[longest].mean - base) / at / (share[longest] - share[shortest])
-            add(at, offset - back * at, peaks.noise, electrons)
-    hidden = peaks is None and sqrt(variance) / gain > 1.2
-    few = (1.0,) if points else (1.0, 0.93, 1.07) if hidden else SHIFTS
-    for shift in SHIFTS if gain < FINE and not hidden else few:
-        at = gain * shift
+            add(at, offset - back * at, peak.noise, electrons)
+    hidden = not peaks and sqrt(variance) / gain > 1.2
+    step = min(STEP * gain / max(brightest, 1e-9), 0.1)
+    steps = range(-SHIFTS, SHIFTS + 1)
+    if points and gain >= FINE:
+        steps = range(1)
+    for number in steps:
+        at = gain * (1 + number * step)
         total = variance / at**2
         tried = () if hidden else NOISES if gain < 2 * FINE else (0.35, 0.6)
         if several:
@@ -86,7 +91,7 @@ def starts_of(cells: Sequence[Cell], share: Array, darks: int) -> Starts:
         for noise in {*tried, *(sqrt(part * total) for part in PARTS)}:
             electrons = max(total - noise**2, 0.003 * total)
             add(at, cells[shortest].mean - at * electrons, noise, electrons)
-    visible = peaks.noise if peaks else 0.35 if gain >= FINE else 0.15
+    visible = peaks[0].noise if peaks else 0.35 if gain >= FINE else 0.15
     return Starts(points, sqrt(variance) / gain if hidden else visible, hidden)
 
 
@@ -102,13 +107,14 @@ def first_gain(cells: Sequence[Cell]) -> float:
     return max(float(variance.max() / max(np.ptp(mean), 1e-9)), 1e-6)
 
 
-def electron_peaks(cells: Sequence[Cell], gain: float) -> Peaks | None:
-    """Return the electron peaks near a gain; None if none show. The codes' transform at 1/gain is exp(-2 pi^2 noise^2).
+def electron_peaks(cells: Sequence[Cell], gain: float) -> list[Peaks]:
+    """Return the electron peaks near a gain, if any show. The codes' transform at 1/gain is exp(-2 pi^2 noise^2).
 
-    It is a local maximum over frequency, because the Poisson law is one at whole turns.
+    It is a local maximum over frequency, because the Poisson law is one at whole turns. Codes are whole numbers, so the
+    transform at one turn per code less a frequency is as large, and both may be near the gain.
     """
     if gain < COMB:
-        return None
+        return []
     highest = max(int(cell.codes.max()) for cell in cells) + 1
     histogram = np.sum([np.bincount(cell.codes.ravel(), minlength=highest) for cell in cells], axis=0)
     share = histogram / histogram.sum()
@@ -117,34 +123,35 @@ def electron_peaks(cells: Sequence[Cell], gain: float) -> Peaks | None:
     first, last = int(size / (1.4 * gain)), min(int(size / (0.7 * gain)) + 1, int(0.97 * size))
     inner = size_of[first:last]
     if len(inner) < 3:
-        return None
+        return []
     local = np.flatnonzero((inner[1:-1] > inner[:-2]) & (inner[1:-1] > inner[2:])) + 1
     if len(local) == 0:
-        return None
+        return []
     best = int(local[np.argmax(inner[local])])
     height = float(inner[best])
     if height < CLEAR / sqrt(histogram.sum()):
-        return None
+        return []
     left, right = inner[best - 1], inner[best + 1]
     turn = 0.5 * (left - right) / (left - 2 * height + right)
     frequency = (first + best + turn) / size
     codes = np.arange(highest)
-    value = complex(share @ np.exp(2j * pi * frequency * codes))
-    found = 1 / frequency
-    left_by_rounding = float(np.sinc(frequency))
-    noise = sqrt(max(-log(max(abs(value) / left_by_rounding, 1e-12)) / (2 * pi**2), 0.06**2))
-    return Peaks(found, noise, float(np.angle(value) / (2 * pi) * found) % found)
+    found = []
+    for turns in (frequency, 1 - frequency):
+        if not first <= turns * size <= last:
+            continue
+        value = complex(share @ np.exp(2j * pi * turns * codes))
+        left_by_rounding = float(np.sinc(turns))
+        noise = sqrt(max(-log(max(abs(value) / left_by_rounding, 1e-12)) / (2 * pi**2), 0.06**2))
+        found.append(Peaks(1 / turns, noise, float(np.angle(value) / (2 * pi * turns)) % (1 / turns)))
+    return found
 
 
-def distinct(points: Sequence[Array], values: Sequence[float], count: int, apart: float) -> list[Array]:
-    """Return the `count` likeliest points that differ in ln gain by `apart`, in offset or in read noise."""
+def distinct(points: Sequence[Array], values: Sequence[float], count: int) -> list[Array]:
+    """Return the `count` likeliest points that differ in offset or in read noise."""
     kept: list[Array] = []
     for i in np.argsort(values)[::-1]:
         point = points[i]
-        near = any(
-            abs(point[0] - p[0]) < apart and abs(point[1] - p[1]) < 0.25 * exp(p[0]) and abs(point[2] - p[2]) < 0.3
-            for p in kept
-        )
+        near = any(abs(point[1] - p[1]) < 0.25 * exp(p[0]) and abs(point[2] - p[2]) < 0.3 for p in kept)
         if not near:
             kept.append(point)
         if len(kept) == count:
