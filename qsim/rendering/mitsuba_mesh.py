@@ -16,12 +16,15 @@ POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "ve
 
 def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any, faces: range | None = None) -> Any:
     """Return a Mitsuba mesh with these vertices [V, 3] in m, of all or some faces; `properties` holds its bsdf."""
-    shown = mesh.faces if faces is None else mesh.faces[faces.start : faces.stop]
+    used = vertices_of(mesh, faces)
+    shown, uv = mesh.faces, mesh.uv
+    if faces is not None:
+        shown = np.searchsorted(used, mesh.faces[faces.start : faces.stop])
+        uv = None if uv is None else uv[used]
     properties["face_normals"] = not mesh.smooth
-    uv = mesh.uv
     shape = mi.Mesh(
         name,
-        len(vertices),
+        len(vertices[used]),
         len(shown),
         has_vertex_normals=mesh.smooth,
         has_vertex_texcoords=uv is not None,
@@ -29,7 +32,7 @@ def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any,
     )
     shape.set_id(name)
     parameters = mi.traverse(shape)
-    parameters[POSITIONS] = vertices.astype(np.float32).ravel()
+    parameters[POSITIONS] = vertices[used].astype(np.float32).ravel()
     parameters[FACES] = shown.astype(np.uint32).ravel()
     if uv is not None:
         parameters[TEXCOORDS] = uv.astype(np.float32).ravel()
@@ -37,9 +40,14 @@ def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any,
         parameters.update()
     if mesh.smooth:
         # Mitsuba sums normals over faces in parallel, in an order that changes from run to run.
-        parameters[NORMALS] = vertex_normals(vertices, mesh.faces).ravel()
+        parameters[NORMALS] = vertex_normals(vertices, mesh.faces)[used].ravel()
         parameters.update()
     return shape
+
+
+def vertices_of(mesh: Mesh, faces: range | None) -> Any:
+    """Return the sorted numbers of the vertices of some faces, or a slice of all for all faces (None)."""
+    return slice(None) if faces is None else np.unique(mesh.faces[faces.start : faces.stop])
 
 
 def vertex_normals(vertices: Array, faces: Array) -> Array:

@@ -20,7 +20,7 @@ from numpy import ndarray as Array
 from qsim.device_lock import one_thread_at_a_time
 from qsim.rendering import mitsuba_xml
 from qsim.rendering.engine import errors_only, opaque
-from qsim.rendering.mitsuba_mesh import NORMALS, POSITIONS, mesh_shape, vertex_normals
+from qsim.rendering.mitsuba_mesh import NORMALS, POSITIONS, mesh_shape, vertex_normals, vertices_of
 from qsim.scene import Body, Mesh, Part, Scene, lights, materials
 from qsim.scene.bands import Colour, largest, numbers
 from qsim.scene.environment import environment_map, sky_map, sun_direction, sun_radiance
@@ -50,6 +50,7 @@ class Stage:
         self._placed: dict[str, bytes] = {}
         self._normals: dict[str, Array] = {}  # of smooth bodies that moved; replace those of Mitsuba
         self._rest_normals: dict[str, Array] = {}
+        self._used: dict[str, Any] = {}  # the vertices of each shape of a body
         self._time: float | None = None  # of the last placement [s]
         self._steady = {name: self._emission(name) for name in scene.flickers}
 
@@ -106,7 +107,8 @@ class Stage:
 
     def first_faces(self) -> dict[str, int]:
         """Return shape id -> number of its first face in the mesh of its body; 0 where a body is one shape."""
-        return {name: faces.start for i, body in enumerate(self.scene.bodies) for name, _, faces in _shapes(i, body)}
+        shapes = [shape for i, body in enumerate(self.scene.bodies) for shape in _shapes(i, body)]
+        return {name: 0 if faces is None else faces.start for name, _, faces in shapes}
 
     def _place_body(self, number: int, body: Body, t: float) -> None:
         pose = body.pose(t)
@@ -114,10 +116,14 @@ class Stage:
             self._set(f"body{number}.to_world", pose, lambda: self._transform(pose))
             return
         world = _to_world(pose, body.vertices(t)).astype(np.float32)
-        for name, _, _ in _shapes(number, body):
-            moved = self._set(f"{name}.{POSITIONS}", world, lambda: world.ravel())
+        for name, _, faces in _shapes(number, body):
+            if name not in self._used:
+                self._used[name] = vertices_of(body.mesh, faces)
+            own = world[self._used[name]]
+            moved = self._set(f"{name}.{POSITIONS}", own, lambda own=own: own.ravel())
             if moved and body.mesh.smooth:
-                self._normals[f"{name}.{NORMALS}"] = self._normals_of(f"body{number}", body, pose, world)
+                normals = self._normals_of(f"body{number}", body, pose, world)
+                self._normals[f"{name}.{NORMALS}"] = normals[self._used[name]]
 
     def _normals_of(self, name: str, body: Body, pose: Array, world: Array) -> Array:
         """Return unit normals of a smooth body, float32 [V, 3]; a rigid body's are computed once and rotated."""
@@ -254,20 +260,17 @@ def _scene_dict(mi: Any, scene: Scene, smooth_weight: float) -> dict[str, Any]:
     return parts
 
 
-def _shapes(number: int, body: Body) -> list[tuple[str, materials.Material, range]]:
-    """Return name, material and faces of the shapes of a body: one, or one for each of its patches.
-
-    Each shape has all the vertices of the mesh.
-    """
+def _shapes(number: int, body: Body) -> list[tuple[str, materials.Material, range | None]]:
+    """Return name, material and faces of the shapes of a body: one of all faces (None), or one for each patch."""
     if not isinstance(body.material, materials.Patches):
-        return [(f"body{number}", body.material, range(len(body.mesh.faces)))]
+        return [(f"body{number}", body.material, None)]
     ends = np.cumsum(body.material.counts).tolist()
     names = [f"body{number}", *(f"body{number}_{k}" for k in range(1, len(ends)))]
     faces = [range(start, end) for start, end in zip([0, *ends], ends, strict=False)]
     return list(zip(names, body.material.materials, faces, strict=True))
 
 
-def _mesh(mi: Any, mesh: Mesh, name: str, vertices: Array, material: materials.Material, faces: range) -> Any:
+def _mesh(mi: Any, mesh: Mesh, name: str, vertices: Array, material: materials.Material, faces: range | None) -> Any:
     properties = mi.Properties()
     if isinstance(material, materials.Glow):
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": _value(mi, material.radiance)})

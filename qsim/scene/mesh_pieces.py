@@ -8,8 +8,10 @@ projected along the nearest axis, as have meshes of files without any.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,7 @@ from qsim.scene.materials import Diffuse, Patches, Picture, Texture
 from qsim.scene.scene import Mesh
 
 Array = NDArray[np.float64]
+MOST_TEXELS = 1 << 27  # of the pictures of all materials of a file
 OUTSIDE = 1e-6  # by which coordinates on a clamped axis may leave 0 .. 1
 
 
@@ -31,6 +34,17 @@ class Paint:
     image: Callable[[], tuple[Picture, str]] | None = None  # reads the picture, and names it by its SHA-256
     wrap: tuple[str, str] = ("repeat", "repeat")  # of u and v: "repeat", "mirror" or "clamp"
     nearest: bool = False
+
+
+class HasPaint(Protocol):
+    """A piece of any file."""
+
+    @property
+    def paint(self) -> Paint | None:
+        """The base colour of its faces."""
+
+
+Painted = TypeVar("Painted", bound=HasPaint)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,25 +60,34 @@ class Piece:
 def material_of(pieces: Sequence[Piece]) -> Diffuse | Patches | None:
     """Return the material of a mesh that has the faces of all pieces in their order; None if no piece has a paint.
 
+    The pieces are those of `by_paint`.
     A piece without a paint beside others is white. `ValueError` and `FileNotFoundError` for pictures that are missing,
     cannot be read, or repeat in a way that cannot be shown, with the name of the file and of the material.
     """
     if all(piece.paint is None for piece in pieces):
         return None
-    made: dict[int, Diffuse] = {}
     materials: list[Diffuse] = []
     counts: list[int] = []
-    for piece in pieces:
-        paint = piece.paint or _WHITE
-        alike = [other.uv for other in pieces if other.paint is piece.paint and other.uv is not None]
-        if id(paint) not in made:
-            made[id(paint)] = Diffuse(_texture(paint, alike))
-        if materials and materials[-1] is made[id(paint)]:
-            counts[-1] += len(piece.faces)
-        else:
-            materials.append(made[id(paint)])
-            counts.append(len(piece.faces))
+    texels = 0
+    for _, group in itertools.groupby(pieces, lambda piece: id(piece.paint)):
+        alike = list(group)
+        paint = alike[0].paint or _WHITE
+        texture = _texture(paint, [piece.uv for piece in alike if piece.uv is not None])
+        assert isinstance(texture.image, Picture)
+        texels += texture.image.colours.size // 3
+        if texels > MOST_TEXELS:
+            raise ValueError(f"{paint.where}: the pictures of the file have more than {MOST_TEXELS} pixels in all")
+        materials.append(Diffuse(texture))
+        counts.append(sum(len(piece.faces) for piece in alike))
     return materials[0] if len(materials) == 1 else Patches(tuple(materials), tuple(counts))
+
+
+def by_paint(pieces: Sequence[Painted]) -> list[Painted]:
+    """Return pieces whose paints follow one another, in the order of their first piece."""
+    first: dict[int, int] = {}
+    for i, piece in enumerate(pieces):
+        first.setdefault(id(piece.paint), i)
+    return sorted(pieces, key=lambda piece: first[id(piece.paint)])
 
 
 def _texture(paint: Paint, coordinates: Sequence[Array]) -> Texture:
@@ -73,7 +96,7 @@ def _texture(paint: Paint, coordinates: Sequence[Array]) -> Texture:
     if paint.image is None:
         return Texture(Picture(factor.reshape(1, 1, 3)))
     picture, source = paint.image()
-    colours = picture.colours * factor
+    colours = picture.colours * factor if paint.factor != (1.0, 1.0, 1.0) else picture.colours
     wrap, repeat = list(paint.wrap), [1.0, 1.0]
     if wrap[0] != wrap[1] and coordinates:
         # Mitsuba wraps both axes alike. Within 0 .. 1 a mirrored picture is a clamped one, also between the outermost

@@ -18,7 +18,7 @@ import numpy as np
 
 from qsim.scene.files_beside import file_beside, picture_of, regular_bytes
 from qsim.scene.materials import Picture
-from qsim.scene.mesh_pieces import Paint, Piece
+from qsim.scene.mesh_pieces import Paint, Piece, by_paint
 
 # Options of map_Kd, and the largest number of values of each; those of _LEFT_OUT do not change the picture here.
 _OPTIONS = {"-s": 3, "-o": 3, "-clamp": 1, "-blendu": 1, "-blendv": 1, "-boost": 1, "-cc": 1, "-texres": 1, "-bm": 1}
@@ -32,6 +32,7 @@ class _Materials:
         self.path = path
         self.paints: dict[str, Paint] = {}
         self.placed: dict[str, np.ndarray] = {}
+        self._pictures: dict[tuple[Path, str], tuple[Picture, str]] = {}
         self.problem: OSError | ValueError | None = None  # of a file that is missing or outside of the folder
 
     def read(self, named: str) -> None:
@@ -81,6 +82,12 @@ class _Materials:
         red, green, blue = colour
         self.paints[name] = Paint(old.where, (red, green, blue), old.image, old.wrap)
 
+    def _read_picture(self, where: str, named: str, folder: Path) -> tuple[Picture, str]:
+        """Return a picture; several materials may share it."""
+        if (folder, named) not in self._pictures:
+            self._pictures[folder, named] = picture_of(self.path, where, named, folder)
+        return self._pictures[folder, named]
+
     def finish(self) -> None:
         """Let materials be refused in use whose colour blackens their picture, as some programs write by mistake."""
         for name, paint in self.paints.items():
@@ -109,7 +116,7 @@ class _Materials:
             raise ValueError(f"{where}: map_Kd names no picture")
         named = " ".join(rest).replace("\\", "/")
         old = self.paints[name]
-        read = functools.partial(picture_of, self.path, old.where, named, file.parent)
+        read = functools.partial(self._read_picture, old.where, named, file.parent)
         self.paints[name] = Paint(old.where, old.factor, read, (wrap, wrap))
 
 
@@ -164,7 +171,7 @@ def obj_pieces(path: Path) -> list[Piece]:
     if any(len(vertex) != 3 for vertex in vertices):
         raise ValueError(f"mesh {path}: a vertex needs three numbers")
     points, places = np.array(vertices, np.float64).reshape(-1, 3), np.array(coordinates, np.float64).reshape(-1, 2)
-    return [_piece(points, places, np.array(list(faces[key])), key, materials) for key in faces]
+    return by_paint([_piece(points, places, np.array(list(faces[key])), key, materials) for key in faces])
 
 
 def _piece(

@@ -29,7 +29,7 @@ from qsim.scene.animated.gltf_nodes import (
 )
 from qsim.scene.animated.skinning import LARGEST, Joint, Morph, Skinned, check_shares
 from qsim.scene.animated.tracks import Clock, Fixed, Keyed, Track
-from qsim.scene.mesh_pieces import Paint, Piece
+from qsim.scene.mesh_pieces import Paint, Piece, by_paint
 from qsim.scene.motion import Motion, Still
 from qsim.scene.rotation import pose_matrix
 from qsim.scene.scene import Mesh
@@ -140,7 +140,7 @@ def _read(
                 raise ValueError(f"{document.path}: its meshes have more than {MOST_VERTICES} vertices in all")
     if not pieces:
         raise ValueError(f"{document.path}: its scene has no mesh")
-    return pieces, joints
+    return by_paint(pieces), joints
 
 
 def _shown(

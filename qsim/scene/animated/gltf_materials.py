@@ -48,6 +48,7 @@ class Paints:
     def __init__(self, document: Document) -> None:
         self._document = document
         self._found: dict[int, tuple[Paint, dict[str, Any] | None]] = {}
+        self._pictures: dict[int, tuple[Picture, str]] = {}  # several textures may share one
 
     def paint(self, number: int | None, by: str) -> Paint | None:
         """Return the paint of material `number`; None for none."""
@@ -120,6 +121,12 @@ class Paints:
         if source is None:
             why = f"only one of {BASIS}, which is not read" if BASIS in others else "none"
             raise ValueError(f"{document.path}: {by} needs a picture and has {why}; export PNG or JPEG")
+        if source not in self._pictures:
+            self._pictures[source] = self._picture(source, by)
+        return self._pictures[source]
+
+    def _picture(self, source: int, by: str) -> tuple[Picture, str]:
+        document = self._document
         about = document.entry("images", source, IMAGE, by)
         where = f"{document.path}: images[{source}]"
         if about.get("bufferView") is not None:

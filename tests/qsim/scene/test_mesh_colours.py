@@ -298,16 +298,16 @@ def test_a_body_that_bends_has_its_colours_and_the_truth_of_all_its_patches(tmp_
     file = arm()
     primitive = file.content["meshes"][0]["primitives"][0]
     whole = np.concatenate([[(i, i + 2, i + 1), (i + 1, i + 2, i + 3)] for i in range(0, 12, 2)])
-    halves = [file.add(part.ravel(), "u2") for part in (whole[:5], whole[5:])]
+    parts = [(whole[:3], 0), (whole[3:8], 1), (whole[8:], 0)]  # those of one material become one patch
     file.content["meshes"][0]["primitives"] = [
-        primitive | {"indices": each, "material": i} for i, each in enumerate(halves)
+        primitive | {"indices": file.add(faces.ravel(), "u2"), "material": i} for faces, i in parts
     ]
     file.content["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [c, c, c, 1]}} for c in (0.2, 0.8)]
     path = file.write(tmp_path / "arm.glb")
     mesh, motion = animated_file(path, 2.0, carrier=Still())
     material = mesh_material(path)
     assert isinstance(material, Patches)
-    assert material.counts == (5, 7)
+    assert material.counts == (7, 5)
     frames = []
     for each in (material, Diffuse(0.5)):
         camera = Camera(3e-5, 2.8, 1e-6, 12, 40, origin=(0, 0, 2.0))
@@ -319,6 +319,16 @@ def test_a_body_that_bends_has_its_colours_and_the_truth_of_all_its_patches(tmp_
     on = frames[0].radiance[frames[0].body_id == 0]
     assert on.min() < 0.45
     assert on.max() > 0.75
+
+
+def test_a_small_file_that_shows_one_picture_often_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("qsim.scene.mesh_pieces.MOST_TEXELS", 100)
+    file = gltf()
+    primitive = file.content["meshes"][0]["primitives"][0]
+    file.content["meshes"][0]["primitives"] = [primitive | {"material": i} for i in range(20)]
+    file.content["materials"] *= 20
+    with pytest.raises(ValueError, match=r"materials\[8\]: the pictures of the file have more than 100 pixels in all"):
+        mesh_material(file.write(tmp_path / "often.glb"))
 
 
 def test_a_texture_wraps_in_a_known_way():
