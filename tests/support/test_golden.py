@@ -57,13 +57,18 @@ def quiver_codes(*shape: int) -> dict[str, np.ndarray]:
     return {"codes": np.random.default_rng(3).integers(0, 8, shape)}
 
 
-def test_the_program_prints_errors_and_fails_on_missing_keys(tmp_path, capsys):
+@pytest.mark.slow
+def test_the_program_prints_errors(tmp_path, capsys):
     small, table = tmp_path / "small.npz", DATA / "published_state_dict.tsv"
     cut(DATA / "golden_quiver_c16.npz", small, ["codes", "flow4", "out1"])
     assert main(["quiver", str(small), str(table)]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found.keys() == {"flow4", "out1"}
     assert max(found.values()) < 1e-6
+
+
+def test_the_program_fails_on_missing_keys(tmp_path, capsys):
+    small, table = tmp_path / "small.npz", DATA / "published_state_dict.tsv"
     np.savez(small, **quiver_codes(1, 11, 1, 16, 16), strange=np.zeros(3))
     assert main(["quiver", str(small), str(table), "--prefix", "x."]) == 1
     assert json.loads(capsys.readouterr().out) == {"strange": None}

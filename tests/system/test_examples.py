@@ -15,7 +15,17 @@ sys.path.append(str(ROOT / "docs"))
 from manual import examples  # noqa: E402
 
 EXAMPLES = sorted(examples.FOLDER.glob("*.py"))
-SLOW = ("on_a_cluster", "pytorch", "restoring", "training")  # 5 to 25 s of processor time; the others up to 3 s
+SLOW = (  # 4 to 25 s of processor time; the others up to 3 s
+    "bit_depth",
+    "bracketing",
+    "challenge",
+    "colour",
+    "on_a_cluster",
+    "pytorch",
+    "readouts",
+    "restoring",
+    "training",
+)
 
 
 def test_there_are_examples():

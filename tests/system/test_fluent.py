@@ -54,6 +54,7 @@ def test_types_are_shipped(package: str):
     assert (ROOT / package / "py.typed").is_file()
 
 
+@pytest.mark.slow
 def test_a_user_gets_types(tmp_path: Path):
     """mypy finds the types of the chain in a user's program, through the lazy names."""
     program = tmp_path / "mine.py"

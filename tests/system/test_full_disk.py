@@ -123,7 +123,7 @@ def resize(mount: Path, size: int) -> None:
     subprocess.run(["mount", "-o", f"remount,size={size}", str(mount)], check=True)
 
 
-@pytest.mark.parametrize("pages", [1, 20, 36])
+@pytest.mark.parametrize("pages", [20, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 36))])
 def test_two_workers_on_a_disk_that_is_really_full(full: Path, undisturbed: dict[str, bytes], pages: int):
     """Full from the start, in the middle, and near the end: here a file takes a page, and all of them take 38.
 
@@ -141,7 +141,7 @@ def test_two_workers_on_a_disk_that_is_really_full(full: Path, undisturbed: dict
     assert tree(full / "d") == undisturbed
 
 
-@pytest.mark.parametrize("name", ["fan_0000", "tumble_0004"])
+@pytest.mark.parametrize("name", ["tumble_0004", pytest.param("fan_0000", marks=pytest.mark.slow)])
 def test_two_workers_of_which_one_meets_a_full_disk(
     tmp_path: Path, undisturbed: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, name: str
 ):

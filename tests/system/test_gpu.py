@@ -152,8 +152,8 @@ def test_what_is_measured_is_not_measured_again(bench, capsys):
     [
         ("fail", "failed", "ValueError: the scene is black"),
         ("crash", "failed", "its process ended with signal SIGABRT"),
-        ("leave", "failed", "its process ended with exit code 0"),
-        ("absent", "absent", "no CUDA device here"),
+        pytest.param("leave", "failed", "its process ended with exit code 0", marks=pytest.mark.slow),
+        pytest.param("absent", "absent", "no CUDA device here", marks=pytest.mark.slow),
     ],
 )
 def test_a_failing_section_states_why_and_the_others_are_measured(bench, capsys, act, state, why):
@@ -240,6 +240,7 @@ def test_a_resumable_measurement_keeps_what_it_has(bench):
     assert bench.state("train.one") == "done"
 
 
+@pytest.mark.slow
 def test_what_is_killed_after_a_part_continues_in_the_next_piece(bench, capsys):
     """A clip that takes longer than those before it makes no measurement "late", which the same command leaves."""
     bench.acts(train_one="part", doctor_machine=None, sensor_one=None, render_one=None)
@@ -323,6 +324,7 @@ def _gone(pid: int) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are looked up in /proc")
+@pytest.mark.slow
 def test_killed_at_any_moment_it_continues_and_leaves_no_process(bench):
     rng = random.Random(0)
     bench.acts(**{f"sensor_n{i}": 0.05 for i in range(4)})
@@ -438,6 +440,7 @@ def _wheel(folder: Path, name: str, version: str, text: str) -> None:
         file.writestr(f"{about}/RECORD", "")
 
 
+@pytest.mark.slow
 def test_wheels_serve_measurements_and_replace_nothing(bench, tmp_path, capsys):
     pytest.importorskip("pip")
     wheels = tmp_path / "wheels of mine"

@@ -37,6 +37,7 @@ def test_mistakes_are_one_sentence(tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_the_memory_of_the_command_is_that_of_its_process():
     """At least what Python and torch take; nothing of this process, which a child's `ru_maxrss` would count."""
     held = np.ones(1 << 28)  # 2 GiB

@@ -106,23 +106,24 @@ def test_scenes_of_a_user_and_of_this_project_do_not_meet(installed: Path, tmp_p
 
 def test_an_installation_renders_senses_and_restores(installed: Path, tmp_path: Path):
     """Every file that these commands import must come from the installation, not from this tree."""
-
-    def command(program: str, *words: str) -> str:
-        code = (
-            "import sys, pathlib, qsim.cli, quiver.cli\n"
-            f"ended = {program}.cli.main({list(words)!r})\n"
-            "names = [n for n in sys.modules if n.split('.')[0] in ('qsim', 'quiver')]\n"
-            "files = [getattr(sys.modules[n], '__file__', None) for n in names]\n"
-            f"strange = [f for f in files if f and not f.startswith({str(installed)!r})]\n"
-            "sys.exit(ended or (str(strange) if strange else 0))"
-        )
-        return run(sys.executable, "-c", code, cwd=tmp_path, PYTHONPATH=str(installed))
-
-    assert "variant" in command("qsim", "doctor")
-    size = ("--height", "16", "--width", "24", "--frames", "11")
-    command("qsim", "render", "fan", "-o", "fan", *size, "--psnr", "20")
-    command("qsim", "sense", "fan", "--ppp", "3.25", "--bits", "3")
-    command("quiver", "restore", "fan", "-o", "fan.npy")
+    lines = (
+        "qsim doctor",
+        "qsim render fan -o fan --height 16 --width 24 --frames 11 --psnr 20",
+        "qsim sense fan --ppp 3.25 --bits 3",
+        "quiver restore fan -o fan.npy",
+    )
+    code = (
+        "import sys, qsim.cli, quiver.cli\n"
+        "mains = {'qsim': qsim.cli.main, 'quiver': quiver.cli.main}\n"
+        f"for program, *words in map(str.split, {lines!r}):\n"
+        "    assert mains[program](words) == 0, words\n"
+        "names = [n for n in sys.modules if n.split('.')[0] in ('qsim', 'quiver')]\n"
+        "files = [getattr(sys.modules[n], '__file__', None) for n in names]\n"
+        f"strange = [f for f in files if f and not f.startswith({str(installed)!r})]\n"
+        "sys.exit(str(strange) if strange else 0)"
+    )
+    said = run(sys.executable, "-c", code, cwd=tmp_path, PYTHONPATH=str(installed))
+    assert "variant" in said
     assert (tmp_path / "fan.npy").is_file()
 
 

@@ -47,14 +47,15 @@ def test_shards_in_any_order_give_the_same_bytes(tmp_path: Path, undisturbed: di
         generate(SMALL, tmp_path / "d", Options(shard=(4, 3)), make=make)
 
 
-def test_killed_at_random_moments_sixty_times(tmp_path: Path, undisturbed: dict[str, bytes]):
+@pytest.mark.parametrize("kills", [15, pytest.param(60, marks=pytest.mark.slow)])
+def test_killed_at_random_moments(tmp_path: Path, undisturbed: dict[str, bytes], kills: int):
     """The moments are spread over a complete run; the next run resumes each killed folder, and is killed again."""
     moments = random.Random(5)
     started = time.monotonic()
     assert in_child(functools.partial(generate, SMALL, tmp_path / "timing", HERE, make=make), 600)
     whole = time.monotonic() - started  # in a fork, as below: that of a large process is slower, and no job would end
     killed = rounds = 0
-    while killed < 60:
+    while killed < kills:
         folder = tmp_path / f"d{rounds}"
         rounds += 1
         run = functools.partial(generate, SMALL, folder, HERE, make=make)
@@ -66,11 +67,15 @@ def test_killed_at_random_moments_sixty_times(tmp_path: Path, undisturbed: dict[
                     assert len(clip.streams) == 2
         assert tree(folder) == undisturbed
         shutil.rmtree(folder)
-    assert rounds < 60
+    assert rounds < kills
 
 
-def test_killed_before_every_step(tmp_path: Path):
-    """One job; after a kill before any open, mkdir, remove or rename, the same command makes the same bytes."""
+@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
+def test_killed_before_every_step(tmp_path: Path, every: int):
+    """One job; after a kill before any open, mkdir, remove or rename, the same command makes the same bytes.
+
+    The quick test takes every fifth of them.
+    """
     head, _, tumble = RECIPE.split("[[scenes]]")
     one = recipe.parse(f"{head}[[scenes]]{tumble}".replace("[1, 3]", "[3]"))
     generate(one, tmp_path / "undisturbed", HERE, make=make)
@@ -78,7 +83,7 @@ def test_killed_before_every_step(tmp_path: Path):
     killed, steps = True, 0
     while killed:
         folder = tmp_path / str(steps)
-        steps += 1
+        steps += every
         run = functools.partial(generate, one, folder, HERE, make=make)
         killed = killed_at(steps, folder, run)
         assert run().failed == {}

@@ -39,6 +39,7 @@ def test_an_error_that_hardly_falls_needs_nearly_infinite_samples():
 
 
 @pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install pyoidn")
+@pytest.mark.slow
 def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
     """A lamp without noise fills the middle: the requested error holds for the complete frame."""
     camera = CAMERA.resized(256, 512)
