@@ -1,7 +1,8 @@
 """Runs the tests that compare floats as if on other processors, and prints what passed.
 
     python tests/processors.py                  all emulations, on every test file that compares floats
-    python tests/processors.py --two            the two farthest apart, on stored results: what .ci/run does
+    python tests/processors.py --stored         all emulations, on tests that compare with stored results
+    python tests/processors.py --two            the two farthest apart, on those: what .ci/run does
     python tests/processors.py --only prescott,zen tests/qsim/sensor
 
 An emulation is a set of variables that the libraries read: the kernels of OpenBLAS, the vector instructions of NumPy,
@@ -151,6 +152,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="run the tests that compare floats as if on other processors")
     parser.add_argument("roots", nargs="*", default=["tests"], help="test files or folders (default tests)")
     parser.add_argument("--two", action="store_true", help="the two farthest apart, on stored results")
+    parser.add_argument("--stored", action="store_true", help="only tests that compare with stored results")
     parser.add_argument("--only", help="names of emulations, with commas between them")
     parser.add_argument("--margins", type=Path, help="folder for the shares of the tolerances")
     parser.add_argument("-n", default="2", help="processes at a time (default 2)")
@@ -166,7 +168,7 @@ def main(arguments: list[str] | None = None) -> int:
         chosen = [emulation for emulation in chosen if emulation.name in names]
     if given.margins:
         given.margins.mkdir(parents=True, exist_ok=True)
-    files = files_that_compare(given.roots, STORED if given.two else FLOATS)
+    files = files_that_compare(given.roots, STORED if given.two or given.stored else FLOATS)
     here = flags()
     failed = False
     print(f"{len(files)} test files compare floats", flush=True)
