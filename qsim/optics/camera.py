@@ -96,6 +96,11 @@ class Camera:
         """Return the camera as it is at time t [s]: the same one unless it has a `zoom`. Its motion stays."""
         return self if self.zoom is None else _at(self, float(t))
 
+    def resting(self) -> None:
+        """Raise `ValueError` for a camera whose lens changes: what asks for its view needs `at` of a time."""
+        if self.zoom is not None:
+            raise ValueError("Camera.zoom: the lens changes with time; pass camera.at(t), the camera at the time t [s]")
+
     def _zoomed(self, t: float) -> Camera:
         assert self.zoom is not None
         share, lens = self.zoom.at(t)
@@ -185,7 +190,8 @@ class Camera:
         return placed if self.motion is None else placed @ np.asarray(self.motion.pose(t), np.float64)
 
     def directions(self) -> np.ndarray:
-        """Return rays through the pixel centres in camera axes with z = 1, float64 [H, W, 3]."""
+        """Return rays through the pixel centres in camera axes with z = 1, float64 [H, W, 3]; `ValueError` with a `zoom`."""
+        self.resting()
         slopes = _pixel_slopes(self.height, self.width, self.axis, self.focal_pixels)
         if self.lens is not None:
             slopes = _traced(self.lens, self.height, self.width, self.axis, self.focal_pixels)

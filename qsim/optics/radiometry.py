@@ -112,8 +112,10 @@ def expected_photons(
     """Return expected photons per pixel and exposure, float64 [..., H, W], before quantum efficiency.
 
     `radiance` is [..., H, W] in W m^-2 sr^-1, `exposure` in s. `origin` is the (y, x) of its first pixel in the
-    camera's frame; without it the image is centred on the optical axis. `ValueError` if the exposure is not positive.
+    camera's frame; without it the image is centred on the optical axis. `ValueError` if the exposure is not positive,
+    and for a camera whose lens changes (`Camera.at`).
     """
+    camera.resting()
     if not exposure > 0:
         raise ValueError(f"exposure: expected seconds above 0, got {exposure!r}; a full frame time at 2000 fps is 5e-4")
     radiance = plain(radiance, np.float64)

@@ -91,6 +91,8 @@ def test_each_frame_has_the_light_and_the_lens_of_its_time(tmp_path: Path):
     for t, frame in enumerate(frames):
         assert frame["fl_y"] == pytest.approx(camera.at(t / clip.frame_rate).focal_pixels)
     assert frames[0]["fl_y"] > 1.2 * frames[-1]["fl_y"]
+    with pytest.raises(ValueError, match=r"the lens changes with time; pass camera.at\(t\)"):
+        expected_photons(clip.radiance(0), camera, clip.exposure)
 
 
 def test_an_ideal_lens_is_not_described():
