@@ -1,6 +1,6 @@
-"""Measures how often the 95 % intervals of a SPAD array's calibration hold the truth; writes a page of it.
+"""Measures how often the 95 % intervals of a SPAD array's calibration hold the truth; writes docs/results/coverage.md.
 
-    python benchmarks/coverage_spad.py [ARRAYS [VALUES [KIND]]]    # 200 of each kind, of at most 4e6 values a flat
+    python benchmarks/coverage_spad.py [ARRAYS [VALUES [KIND]]]    # 200 of each kind, of at most 1e6 values a flat
 
 A value is a pixel of a frame; KIND is the beginning of the names of kinds, as in counter.
 
@@ -10,7 +10,6 @@ nothing of qsim; planes and counters of 1 to 8 bits.
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass, replace
 from math import isnan, sqrt
@@ -22,6 +21,7 @@ ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
 from calibration_simulator import SPADArray, vignetting  # noqa: E402
+from coverage_page import cell, store, stored, write_page  # noqa: E402
 
 from qsim.calibration import Calibration, calibrate_spad, measure  # noqa: E402
 
@@ -48,7 +48,7 @@ class SPADCase:
     prnu: float | None = None
     vignetting: float | None = None  # light lost in the corners
     drift: float = 0.005
-    most_values: float = 4e6  # pixels x frames, that limit the time of a test
+    most_values: float = 1e6  # pixels x frames, that limit the time of a test
 
 
 def _either(value: float | None, rng: np.random.Generator, low: float, high: float) -> float:
@@ -156,20 +156,15 @@ def hits_of(case: SPADCase, seed: list[int]) -> dict[str, bool]:
     }
 
 
-def page(rows: dict[str, list[dict[str, bool]]]) -> str:
-    """Return the page of all kinds of arrays."""
+def table(rows: dict[str, list[dict[str, bool]]]) -> list[str]:
+    """Return the lines on all kinds of arrays."""
     rows = {kind: row for kind, row in rows.items() if row}
-    fewest, most = min(map(len, rows.values())), max(map(len, rows.values()))
+    fewest = min(map(len, rows.values()))
     lines = [
-        "# Intervals of a SPAD array's calibration",
-        "",
-        "How many of the 95 % intervals of `qsim calibrate` hold the truth, in percent.",
-        f"Each row is {fewest} to {most} random arrays, made by `python benchmarks/coverage_spad.py`.",
         f"A number of {fewest} arrays is known to ± {100 * sqrt(0.95 * 0.05 / fewest):.1f} (one standard deviation).",
+        "Drawn at random:",
         "",
-        "The frames come from `benchmarks/calibration_simulator.py`, which shares no code with qsim. Drawn at random:",
-        "",
-        "- 12 x 12 to 64 x 64 pixels, 50 to 5,000 frames of a flat, exposures of 0.1 µs to 10 s;",
+        "- 12 x 12 to 64 x 64 pixels, 50 to 5,000 frames of a flat (at most 1e6 values), exposures of 0.1 µs to 10 s;",
         "- PRNU of 1 to 10 %, up to 50 % of the light lost in the corners, 0.5 % drift of the light;",
         "- dark rates that spread by up to 0.8 (of the logarithm), and 0, 0.5 or 2 % hot pixels, some saturated;",
         "- 0, 3 or 10 % afterpulses, crosstalk of 0 or 0.3 % per neighbour, dead times of counters.",
@@ -181,38 +176,28 @@ def page(rows: dict[str, list[dict[str, bool]]]) -> str:
         "|---|--:|" + "--:|" * (len(NAMES) + 1),
     ]
     for kind, hits in rows.items():
-        cells = [_cell([hit[name] for hit in hits if name in hit], len(hits)) for name in NAMES]
+        cells = [cell([hit[name] for hit in hits if name in hit], len(hits)) for name in NAMES]
         percentiles = [held for hit in hits for name, held in hit.items() if name.startswith("dark_count_rate_p")]
-        lines.append(f"| {kind} | {len(hits)} | " + " | ".join([*cells, _cell(percentiles, 0)]) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _cell(held: list[bool], arrays: int) -> str:
-    if not held:
-        return ""
-    share = f"{100 * np.mean(held):.1f}"
-    return share if len(held) == arrays else f"{share} ({len(held)})"
+        lines.append(f"| {kind} | {len(hits)} | " + " | ".join([*cells, cell(percentiles, 0)]) + " |")
+    return lines
 
 
 def main(arrays: int, values: float, chosen: str) -> None:
-    stored = ROOT / "out" / "coverage_spad.json"
-    stored.parent.mkdir(exist_ok=True)
-    rows: dict[str, list[dict[str, bool]]] = json.loads(stored.read_text()) if stored.exists() else {}
+    rows = stored("coverage_spad")
     for number in range(arrays):
         for n, (kind, case) in enumerate(CASES.items()):
             row = rows.setdefault(kind, [])
             if len(row) > number or not kind.startswith(chosen):
                 continue
             row.append(hits_of(replace(case, most_values=values), [n, number]))
-            stored.write_text(json.dumps(rows))
-        path = ROOT / "docs" / "results" / "coverage_spad.md"
-        path.write_text(page(rows))
-        print(f"{number + 1} of {arrays}: {path}", flush=True)
+            store("coverage_spad", rows)
+        print(f"{number + 1} of {arrays}", flush=True)
+    write_page()
 
 
 if __name__ == "__main__":
     main(
         int(sys.argv[1]) if len(sys.argv) > 1 else 200,
-        float(sys.argv[2]) if len(sys.argv) > 2 else 4e6,
+        float(sys.argv[2]) if len(sys.argv) > 2 else 1e6,
         sys.argv[3] if len(sys.argv) > 3 else "",
     )

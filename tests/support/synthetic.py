@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -128,31 +128,6 @@ class SPADCase:
 
 
 COUNTER = SPADCase(bits=5, photons=(2.0, 6.0, 14.0))
-CASES: dict[str, QISCase | SPADCase] = {
-    "resolved peaks": QISCase(),
-    "few frames, few pixels": QISCase(frames=6, side=20, prnu=0.05),
-    "peaks hidden": QISCase(read_noise=0.8, frames=30, gain=6.0),
-    "low gain": QISCase(gain=3.0, offset=10.0, bits=7),
-    "planes": SPADCase(),
-    "planes, many frames": SPADCase(frames=150, side=16),
-    "planes, afterpulses": SPADCase(afterpulsing=0.03),
-    "few dark counts, afterpulses": SPADCase(dark_rate=1.0, afterpulsing=0.03),
-    "counts": COUNTER,
-    "paralyzable counts": replace(COUNTER, dead_time=0.08, paralyzable=True),
-}
-
-
-def coverage(case: QISCase | SPADCase, runs: int, seed: int) -> tuple[dict[str, int], list[float]]:
-    """Return how often the intervals contain the truth, and the p-values of the fits."""
-    rng = np.random.default_rng(seed)
-    hits: dict[str, int] = {}
-    p_values = []
-    for _ in range(runs):
-        found, truth = case.calibrate(rng)
-        p_values.append(found.p_value)
-        for name, value in truth.items():
-            hits[name] = hits.get(name, 0) + (found.values[name].low <= value <= found.values[name].high)
-    return hits, p_values
 
 
 @dataclass(frozen=True)

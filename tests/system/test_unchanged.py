@@ -42,6 +42,7 @@ from quiver import restore
 
 DATA = Path(__file__).parents[1] / "data"
 Array = np.ndarray
+RESPONSE = 1e-3  # relative error of a fitted response, at least
 
 
 Result = str | machines.Result
@@ -522,7 +523,10 @@ def _calibrated(line: str, *words: object) -> Fits:
     found = run(qsim.cli.main, f"calibrate -q {line}", *words)
     table = [found["values"][name] for name in sorted(found["values"])]
     rows = np.array([[row[key] for row in table] for key in ("value", "low", "high")], float)  # null: not a number
-    errors = np.append(np.tile(machines.standard_errors(*rows), 3), machines.P_VALUE_ERROR)
+    # a description of the recording, as its shading, has no interval, but follows the fitted response of the sensor
+    own = machines.standard_errors(*rows)
+    own = np.where(own > 0, own, RESPONSE * np.abs(rows[0]))
+    errors = np.append(np.tile(own, 3), machines.P_VALUE_ERROR)
     return Fits(np.append(rows, np.array(found["p_value"], float)), errors, CLOSED_FORM_TERMS)
 
 

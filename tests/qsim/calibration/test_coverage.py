@@ -1,11 +1,51 @@
-"""Coverage: intervals contain the true value as often as promised."""
+"""Coverage: intervals contain the true value as often as promised, on frames of a simulator that shares no code."""
 
-from dataclasses import replace
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from stats import assert_share
-from synthetic import CASES, COUNTER, QISCase, RandomArray, SPADCase, coverage
+from synthetic import COUNTER, QISCase, RandomArray, SPADCase
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
+from calibration_simulator import random_camera
+from coverage_cameras import BANDS, NAMES, hits_of
+
+
+def camera_hits(cameras: int, seed: int) -> tuple[dict[str, list[bool]], list[bool]]:
+    """Return by value whether intervals of random cameras hold the truth, and whether a model is called wrong."""
+    hits: dict[str, list[bool]] = {name: [] for name in NAMES}
+    warned = []
+    for number in range(cameras):
+        rng = np.random.default_rng([seed, number])
+        found = hits_of(random_camera(rng, BANDS[number % len(BANDS)]), rng)
+        warned.append(found.pop("warned"))
+        for name, held in found.items():
+            hits[name].append(held)
+    return hits, warned
+
+
+def test_intervals_of_cameras_are_not_broken():
+    """Five cameras, one of each band of gain x read noise: of 30 intervals 95 % hold the truth, and no warning."""
+    hits, warned = camera_hits(5, seed=7)
+    held = [hit for row in hits.values() for hit in row]
+    assert len(held) > 25
+    assert_share(sum(held), len(held), 0.95)
+    assert not any(warned)
+
+
+@pytest.mark.slow
+def test_intervals_of_cameras_cover_as_promised():
+    """500 random cameras of gain x read noise from 0.1 to 12 codes: every value within 93 to 97 %.
+
+    The number is allowed its own error: a right interval fails once in a thousand runs. A model is called wrong by a
+    p-value below 0.001.
+    """
+    hits, warned = camera_hits(500, seed=8)
+    for held in hits.values():
+        assert 0.93 - 3.5 * np.sqrt(0.93 * 0.07 / len(held)) < np.mean(held)
+    assert_share(sum(warned), len(warned), 0.001, false_alarm=1e-4)
 
 
 def test_one_calibration_of_each_kind_comes_near_the_truth():
@@ -18,14 +58,7 @@ def test_one_calibration_of_each_kind_comes_near_the_truth():
             assert abs(v.value - value) <= 8 * max(v.high - v.value, v.value - v.low), (name, v, value)
 
 
-@pytest.mark.parametrize("name", ["resolved peaks"])
-def test_quick_coverage(name):
-    """30 calibrations: they cannot tell a coverage of 95 % from 93 %, but find a broken interval."""
-    hits, _ = coverage(CASES[name], 30, seed=1)
-    for count in hits.values():
-        assert_share(count, 30, 0.95, checks=len(hits))
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     [
@@ -35,7 +68,7 @@ def test_quick_coverage(name):
     ],
     ids=["planes", "counts", "none"],
 )
-def test_quick_coverage_of_afterpulsing(case):
+def test_coverage_of_afterpulsing_with_dark_frames_of_few_counts(case):
     """Dark frames of 0.001 counts: they stated an error that was 5 times too small, and had nearly all of the weight.
 
     An interval that ends at 0 holds a truth of 0 in 97.5 %.
@@ -44,23 +77,6 @@ def test_quick_coverage_of_afterpulsing(case):
     found = [case.calibrate(rng, ignore_dead_time=True)[0].values["afterpulsing"] for _ in range(60)]
     hits = sum(value.low <= case.afterpulsing <= value.high for value in found)
     assert_share(hits, 60, 0.95 if case.afterpulsing else 0.975)
-
-
-@pytest.mark.slow
-def test_intervals_cover_as_promised():
-    """1000 calibrations of each case: every parameter within 93 ... 97 %, as docs/coverage.py shows it.
-
-    Each parameter has at least 2000 intervals; one that covers 95 % leaves 93 ... 97 % once in 20,000 times.
-    """
-    hits: dict[str, list[int]] = {}
-    for case in CASES.values():
-        found, p_values = coverage(case, 1000, seed=7)
-        for parameter, count in found.items():
-            hits.setdefault(parameter, []).append(count)
-        if not np.isnan(p_values[0]):
-            assert_share(int(np.sum(np.array(p_values) < 0.05)), 1000, 0.05, false_alarm=1e-4)
-    shares = {parameter: sum(counts) / (1000 * len(counts)) for parameter, counts in hits.items()}
-    assert all(0.93 <= share <= 0.97 for share in shares.values()), shares
 
 
 def prnu_hits(runs: int, seed: int) -> dict[str, list[bool]]:
@@ -72,19 +88,6 @@ def prnu_hits(runs: int, seed: int) -> dict[str, list[bool]]:
         found = array.calibrate(rng).values["prnu"]
         hits.setdefault(array.readout, []).append(found.low <= array.prnu <= found.high)
     return hits
-
-
-def test_quick_coverage_of_prnu():
-    """40 small arrays of planes of any PRNU, vignetting and share of hot pixels: 95 % differs from 65 %."""
-    hits = []
-    for i in range(40):
-        rng = np.random.default_rng([11, i])
-        array = replace(RandomArray.draw(rng), readout="planes", light=0.6, side=14, frames=200)
-        found = array.calibrate(rng).values["prnu"]
-        hits.append(found.low <= array.prnu <= found.high)
-    assert_share(sum(hits), len(hits), 0.95)
-    with pytest.raises(AssertionError):
-        assert_share(26, 40, 0.95)
 
 
 @pytest.mark.slow

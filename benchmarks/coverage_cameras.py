@@ -1,14 +1,14 @@
 """Measures how often the 95 % intervals of a camera's calibration hold the truth; writes docs/results/coverage.md.
 
-    python benchmarks/coverage.py [SENSORS]      # 200 of each band of gain x read noise; a few seconds each
+    python benchmarks/coverage_cameras.py [SENSORS]      # 200 of each band of gain x read noise; a second each
 
-The frames come from benchmarks/camera_simulator.py, which shares no code with qsim. Every sensor is another one: gain,
-read noise, bits, size, frames, light, vignetting, drift, hot pixels and number of dark exposures are drawn at random.
+Continues what out/coverage_cameras.json holds. The frames come from benchmarks/calibration_simulator.py, which shares
+no code with qsim. Every sensor is another one: gain, read noise, bits, size, frames, light, vignetting, drift, hot
+pixels and number of dark exposures are drawn at random.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -19,6 +19,11 @@ import numpy as np
 
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+from calibration_simulator import Camera, random_camera  # noqa: E402
+from coverage_page import cell, store, stored, write_page  # noqa: E402
+
+from qsim.calibration import calibrate_qis, measure  # noqa: E402
 
 BANDS = ((0.1, 0.25), (0.25, 0.5), (0.5, 1.0), (1.0, 2.5), (2.5, 12.0))  # gain x read noise, codes
 NAMES = (
@@ -34,10 +39,8 @@ NAMES = (
 )
 
 
-def hits_of(camera, rng: np.random.Generator) -> dict[str, bool]:  # type: ignore[no-untyped-def]
+def hits_of(camera: Camera, rng: np.random.Generator) -> dict[str, bool]:
     """Return for every printed interval of one camera whether it holds the truth."""
-    from qsim.calibration import calibrate_qis, measure
-
     dark_frames, flat_frames = camera.measure(rng)
     darks = [measure([codes], bits=camera.bits, exposure=t, photons=0.0) for codes, t in dark_frames]
     flats = [measure([codes], bits=camera.bits, exposure=t, photons=p) for codes, t, p in flat_frames]
@@ -53,8 +56,6 @@ def hits_of(camera, rng: np.random.Generator) -> dict[str, bool]:  # type: ignor
 
 def measured(band: tuple[float, float], sensors: Iterable[int]) -> Iterator[dict[str, bool]]:
     """Yield the hits of the random cameras with these numbers; an error counts as a sensor without intervals."""
-    from camera_simulator import random_camera
-
     for number in sensors:
         rng = np.random.default_rng([int(1000 * band[0]), number])
         camera = random_camera(rng, band)
@@ -69,17 +70,13 @@ def measured(band: tuple[float, float], sensors: Iterable[int]) -> Iterator[dict
         yield hits
 
 
-def page(rows: dict[str, list[dict[str, bool]]]) -> str:
-    """Return the page of all bands."""
+def table(rows: dict[str, list[dict[str, bool]]]) -> list[str]:
+    """Return the lines on all bands of cameras."""
     count = max(len(hits) for hits in rows.values())
     lines = [
-        "# Intervals of a camera's calibration",
-        "",
-        "How many of the 95 % intervals of `qsim calibrate` hold the truth, in percent.",
-        f"Each row is up to {count} random cameras, made by `python benchmarks/coverage.py {count}`.",
-        f"A number of a full row is known to ± {100 * sqrt(0.95 * 0.05 / count):.1f} (one standard deviation).",
-        "",
-        "The frames come from `benchmarks/camera_simulator.py`, which shares no code with qsim. Drawn at random:",
+        f"Each row is up to {count} random cameras. A number of a full row is known to ± "
+        f"{100 * sqrt(0.95 * 0.05 / count):.1f} (one standard deviation).",
+        "Drawn at random:",
         "",
         "- read noise of 0.12 to 5 e-, and 2 to 12 bits;",
         "- 12 x 12 to 64 x 64 pixels, and 4 to 40 frames of each stack;",
@@ -90,37 +87,31 @@ def page(rows: dict[str, list[dict[str, bool]]]) -> str:
         "",
         "An empty cell: nothing is printed. A number in brackets: printed for so many of the cameras.",
         "",
-        "| gain x read noise, codes | " + " | ".join(f"`{name}`" for name in NAMES) + " | warned |",
-        "|---|" + "--:|" * (len(NAMES) + 1),
+        "| gain x read noise, codes | cameras | " + " | ".join(f"`{name}`" for name in NAMES) + " | warned |",
+        "|---|--:|" + "--:|" * (len(NAMES) + 1),
     ]
-    for band, hits in rows.items():
-        cells = []
-        for name in NAMES:
-            printed = [h[name] for h in hits if name in h]
-            share = f"{100 * np.mean(printed):.1f}" if printed else ""
-            cells.append(f"{share} ({len(printed)})" if printed and len(printed) < len(hits) else share)
+    everything = [hits for row in rows.values() for hits in row]
+    for name, hits in [*rows.items(), ("all", everything)]:
+        cells = [cell([h[value] for h in hits if value in h], len(hits)) for value in NAMES]
         warned = 100 * np.mean([h.get("warned", False) for h in hits])
-        lines.append(f"| {band} | " + " | ".join(cells) + f" | {warned:.1f} |")
-    lines += [
+        lines.append(f"| {name} | {len(hits)} | " + " | ".join(cells) + f" | {warned:.1f} |")
+    return [
+        *lines,
         "",
-        "The last column is the share with the warning that the model is wrong. It is right for all of them.",
+        "The last column is the share with the warning that the model is wrong. It is right for all of them, and the",
+        "warning is printed at a p-value below 0.001.",
     ]
-    return "\n".join(lines) + "\n"
 
 
 def main(sensors: int) -> None:
-    stored = ROOT / "out" / "coverage.json"
-    stored.parent.mkdir(exist_ok=True)
-    rows: dict[str, list[dict[str, bool]]] = json.loads(stored.read_text()) if stored.exists() else {}
+    rows = stored("coverage_cameras")
     for number in range(sensors):
         for band in BANDS:
             row = rows.setdefault(f"{band[0]:g} to {band[1]:g}", [])
             if len(row) == number:
                 row += measured(band, [number])
-                stored.write_text(json.dumps(rows))
-    path = ROOT / "docs" / "results" / "coverage.md"
-    path.write_text(page({name: row[:sensors] for name, row in rows.items()}))
-    print(path)
+                store("coverage_cameras", rows)
+    write_page()
 
 
 if __name__ == "__main__":
