@@ -190,7 +190,7 @@ class Camera:
         return placed if self.motion is None else placed @ np.asarray(self.motion.pose(t), np.float64)
 
     def directions(self) -> np.ndarray:
-        """Return rays through the pixel centres in camera axes with z = 1, float64 [H, W, 3]; `ValueError` with a `zoom`."""
+        """Return rays through pixel centres in camera axes with z = 1, float64 [H, W, 3]; no `zoom` (`resting`)."""
         self.resting()
         slopes = _pixel_slopes(self.height, self.width, self.axis, self.focal_pixels)
         if self.lens is not None:
