@@ -68,15 +68,17 @@ def material_of(pieces: Sequence[Piece]) -> Diffuse | Patches | None:
         return None
     materials: list[Diffuse] = []
     counts: list[int] = []
-    texels = 0
+    shown: dict[int, int] = {}  # pixels of each picture; materials may share one
     for _, group in itertools.groupby(pieces, lambda piece: id(piece.paint)):
         alike = list(group)
         paint = alike[0].paint or _WHITE
         texture = _texture(paint, [piece.uv for piece in alike if piece.uv is not None])
         assert isinstance(texture.image, Picture)
-        texels += texture.image.colours.size // 3
-        if texels > MOST_TEXELS:
-            raise ValueError(f"{paint.where}: the pictures of the file have more than {MOST_TEXELS} pixels in all")
+        shown[id(texture.image.colours)] = texture.image.colours.size // 3
+        if sum(shown.values()) > MOST_TEXELS:
+            raise ValueError(
+                f"{paint.where}: the pictures of the file have over {MOST_TEXELS} pixels in all; export smaller ones"
+            )
         materials.append(Diffuse(texture))
         counts.append(sum(len(piece.faces) for piece in alike))
     return materials[0] if len(materials) == 1 else Patches(tuple(materials), tuple(counts))
