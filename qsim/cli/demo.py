@@ -7,6 +7,7 @@ are in the package (qsim/measurements/, with their licences).
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import shlex
 import subprocess
@@ -20,9 +21,11 @@ import numpy as np
 
 from qsim.cli.console import OPTIONAL, RESUMES, command, failed, output
 from qsim.cli.options import check_free
+from qsim.files import to_json, write_bytes, write_json
 from qsim.terminal import is_lost
 
 MEASUREMENTS = Path(__file__).parents[1] / "measurements"
+MARK = "demo.json"  # marks a folder as one that this command fills
 MINUTES = "2"  # of training
 RATE = "3e-4"  # a tenth of the protocol's: the weights are trained already
 LIGHT = ("--ppp", "3.25", "--bits", "3")
@@ -47,7 +50,7 @@ def _run_demo(args: argparse.Namespace) -> int:
         if not find_spec(package):
             raise ModuleNotFoundError(f"No module named {package!r}", name=package)
     started, out = time.perf_counter(), args.folder
-    out.mkdir(parents=True, exist_ok=True)
+    claim(out)
     try:
         steps(out, args.quiet or args.json)
     except subprocess.CalledProcessError as error:
@@ -59,6 +62,17 @@ def _run_demo(args: argparse.Namespace) -> int:
     facts = {"page": str(page), "minutes": minutes, "largest_process_bytes": peak}
     output(args, facts, f"\ndemo: {minutes:.1f} minutes, largest process {peak / 2**30:.2f} GB; open {page}")
     return 0
+
+
+def claim(out: Path) -> None:
+    """Make the folder and mark it; `FileExistsError` if it holds files but not the mark: somebody else's."""
+    mark, ours = out / MARK, {"format": "qsim-demo-1"}
+    if mark.is_file() and not mark.is_symlink() and mark.read_bytes() == to_json(ours):
+        return
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileExistsError(f"{out}: exists and was not made by `qsim demo`; name another folder")
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(mark, ours)
 
 
 def call(words: list[str], capture: bool) -> str:
@@ -104,7 +118,9 @@ def steps(out: Path, quiet: bool) -> None:
         restore(data / "clips" / name, out / f"{name}_shipped.npy", NETWORK)
     ball = out / "ball"
     if not ball.exists():
-        np.save(out / "ball_12bit.npy", np.load(MEASUREMENTS / "ball_12bit.npz")["frames"])
+        content = io.BytesIO()
+        np.save(content, np.load(MEASUREMENTS / "ball_12bit.npz")["frames"])
+        write_bytes(out / "ball_12bit.npy", content.getvalue())
         camera = ("--frame-rate", "30000", "--exposure", "20e-6", "--transfer", "linear", "--white", "4095")
         run("Real video at 30 000 fps becomes a clip", "qsim", "convert", out / "ball_12bit.npy", ball, *camera)
     run("... and is sensed", "qsim", "sense", ball, *LIGHT)
@@ -114,5 +130,5 @@ def steps(out: Path, quiet: bool) -> None:
     real = out / "real_photons.json"
     if not real.exists():
         static = ("evaluate", "--static", MEASUREMENTS / "hazelnut_gates6.npz", "--methods", methods, "--json")
-        real.write_text(run("Scores on real photons", "quiver", *static, capture=True))
+        write_bytes(real, run("Scores on real photons", "quiver", *static, capture=True).encode())
     run("The page", "qsim", "report", out, "-o", out / "index.html", "--force", "--title", title)

@@ -67,6 +67,7 @@ def add_tradeoff(sub: Any) -> None:
 
 TABLE_ONLY = ("read_noise", "motion")
 OF_STUDIES = ("px", "ppp", "bits", "base_fps", "sensor", "plane_sensor", "instants", "frames", "streams")
+PICTURES = {"tradeoff": ("best.png", "tradeoff.png")}  # of a study: which of them depends on its size
 OF_FILES = ("seed", "speed", "output", "force")
 
 
@@ -98,7 +99,8 @@ def _run_tradeoff(args: argparse.Namespace) -> int:
         refuse_idle(args, "tradeoff without --output", ["force"])
     else:
         check_free(args.output)
-        refuse_existing(args.output / f"{name}.json", args.force)
+        for written in (f"{name}.json", *PICTURES.get(name, (f"{name}.png",))):
+            refuse_existing(args.output / written, args.force)
     args.seed = args.seed or 0
     return _tradeoff_study(args) if args.paper_figure is None else _paper_figure(args)
 

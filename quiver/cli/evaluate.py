@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qsim import checks
-from qsim.cli.console import WITHOUT_FORCE, bar, note, output
+from qsim.cli.console import WITHOUT_FORCE, bar, note, output, refuse_existing
 from qsim.cli.options import check_free, checked, count, frame_size, positive, words
 from qsim.files import write_bytes, write_json
 from qsim.locks import Lock
@@ -287,10 +287,8 @@ def _run_bench(args: argparse.Namespace) -> int:
         raise ValueError("--force: replaces a result in -o FOLDER, which is not given; leave it out")
     if args.output is not None:
         check_free(args.output)
-    if args.output is not None and (args.output / "bench.json").exists() and not args.force:
-        raise FileExistsError(
-            f"{args.output / 'bench.json'}: exists; name another with -o, or use --force to replace it"
-        )
+    for written in () if args.output is None else ("bench.json", "bench.md", "bench.png"):
+        refuse_existing(args.output / written, args.force)
     threads.check(args.threads)
     cases = checked_cases(args.methods, args.modes, args.precisions, args.device)
     height, width = args.size

@@ -10,8 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clips import write_clip
+from clips import write_clip, write_dataset
+from waves import wave_clip
 
+from qsim import files
+from qsim.cli import demo
 from qsim.cli import main as qsim
 from qsim.clip.sensing import Sensing, sense
 from qsim.scratch import is_scratch
@@ -53,28 +56,124 @@ def state(place: Path) -> dict[str, object]:
     return found
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_nothing_precious_is_touched(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The present folder, with the inputs of all commands."""
     monkeypatch.chdir(tmp_path)
     clip = write_clip(tmp_path / "clip", frames=2, height=12, width=10)
     sense(clip, Sensing("quiver-physical", bits=3, ppp=3.0))
     np.save("light.npy", np.ones((2, 6, 8), np.float32))
+    return tmp_path
+
+
+def clean(inputs: dict[str, object]) -> None:
+    """Delete everything but the inputs."""
+    for key in sorted(state(Path()), reverse=True):
+        if key not in inputs and os.path.lexists(key):
+            shutil.rmtree(key) if os.path.isdir(key) and not os.path.islink(key) else os.unlink(key)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_nothing_precious_is_touched(name: str, place: Path, capsys):
     main, words = COMMANDS[name]
     output = next(word for word in words if word.startswith("r") and word != "restore")
-    inputs = state(tmp_path)
+    inputs = state(place)
     for i, ending in enumerate(ENDINGS):
         for kind in [KINDS[i % 4], KINDS[(i + 1) % 4]] if name == "restore" else KINDS:  # it is slower
-            (tmp_path / "elsewhere").write_text("far away")
-            stem = Path(output).stem
-            for taken in {f"{output}{ending}", f"{stem}{ending}", f".{stem}{ending}"} - {output}:
-                precious(tmp_path / taken, kind, tmp_path / "elsewhere")
-            before = state(tmp_path)
+            (place / "elsewhere").write_text("far away")
+            for taken in names_beside(output, ending):
+                precious(place / taken, kind, place / "elsewhere")
+            before = state(place)
             code = main([*words, "-q"])
             said = capsys.readouterr().err
-            after = state(tmp_path)
+            after = state(place)
             assert {key: after.get(key) for key in before} == before, (ending, kind)
             assert code == 0 or (code == 2 and said.count("\n") == 1), (ending, kind, said)
             assert not [key for key in after if is_scratch(Path(key))], (ending, kind)
-            for key in sorted(after, reverse=True):
-                if key not in inputs and os.path.lexists(key):
-                    shutil.rmtree(key) if os.path.isdir(key) and not os.path.islink(key) else os.unlink(key)
+            clean(inputs)
+
+
+# Commands that work longer: all names at once, and each name that they write
+
+
+def names_beside(output: str, ending: str) -> set[str]:
+    """Return the names with an ending that a writer could take beside an output."""
+    stem = Path(output).stem
+    return {f"{output}{ending}", f"{stem}{ending}", f".{stem}{ending}"} - {output}
+
+
+LONGER: dict[str, tuple[Callable[[list[str]], int], str]] = {
+    "report": (qsim, "report clip -o r.html"),
+    "explore": (qsim, "explore clip -o r.html"),
+    "tradeoff": (qsim, "tradeoff wave --ppp 1 --bits 1 --instants 1 -o r"),
+    "calibrate": (qsim, "calibrate --planes 50 --dark dark.npy 1e-5 -o r.toml"),
+    "train": (quiver, "train set -o r --preset unet --steps 1 --crop 16 --batch 1"),
+    "evaluate": (quiver, "evaluate set -o r --methods moment"),
+    "bench": (quiver, "bench --methods moment --size 16x16 -o r"),
+    "demo": (qsim, "demo r"),
+}
+
+
+SLOW = {"bench"}
+NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in LONGER]
+
+
+@pytest.fixture
+def longer(place: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    """More inputs, and a demo whose steps write one file each; return the state before any command."""
+    write_dataset(place / "set", {"train": 1, "val": 1, "test": 1})
+    wave_clip(place / "wave", 3, 1)
+    planes = np.random.default_rng(0).binomial(50, 0.2, (4, 6, 8)).astype(np.uint8)
+    np.save("dark.npy", planes)
+
+    def call(words: list[str], capture: bool) -> str:
+        if words[3] == "generate":
+            (place / "r" / "data").mkdir(exist_ok=True)
+            files.write_json(place / "r" / "data" / "dataset.json", {"jobs": {"b": {"split": "test"}}})
+        return "{}"
+
+    monkeypatch.setattr(demo, "call", call)
+    monkeypatch.setattr(demo, "MEASUREMENTS", place)
+    np.savez("ball_12bit.npz", frames=np.ones((1, 2, 2), np.uint16))
+    (place / "elsewhere").write_text("far away")
+    return state(place)
+
+
+def written(name: str) -> tuple[int, dict[str, object]]:
+    main, words = LONGER[name]
+    return main([*words.split(), "-q"]), state(Path())
+
+
+@pytest.mark.parametrize("shift", range(2))
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_precious_beside_an_output_is_touched(name: str, shift: int, longer, place: Path, capsys):
+    output = LONGER[name][1].split(" -o ")[-1].split()[0].removeprefix("demo ") if name != "demo" else "r"
+    for i, ending in enumerate(ENDINGS):
+        for taken in names_beside(output, ending):
+            if not os.path.lexists(taken):
+                precious(place / taken, KINDS[(i + 2 * shift) % 4], place / "elsewhere")
+    before = state(place)
+    code, after = written(name)
+    said = capsys.readouterr().err
+    assert {key: after.get(key) for key in before} == before
+    assert code in (0, 1) or said.count("\n") == 1, said
+    assert not [key for key in after if is_scratch(Path(key))]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_file_of_an_output_replaces_another_without_force(name: str, longer, place: Path, capsys):
+    """Every name that the command writes is taken in turn, by a file and by a link to a file elsewhere."""
+    code, made = written(name)
+    assert code in (0, 1), capsys.readouterr().err
+    names = [key for key in made if key not in longer and not (place / key).is_dir()]
+    assert names
+    for i, taken in enumerate(names):
+        clean(longer)
+        (place / taken).parent.mkdir(parents=True, exist_ok=True)
+        precious(place / taken, ("file", "link")[i % 2], place / "elsewhere")
+        before = state(place)
+        code, after = written(name)
+        said = capsys.readouterr().err
+        assert {key: after.get(key) for key in before} == before, (taken, said)
+        assert code == 2, (taken, said)
+        assert said.count("\n") == 1, (taken, said)

@@ -60,6 +60,7 @@ def test_streams_are_replaced_with_force_and_refused_before_the_study_without(cl
         assert main([*words, *extra]) == 0
     assert Clip.open(out / "streams" / "wave_2bit").stream("multibit").meta["seed"] == 1
     (out / "tradeoff.json").unlink()
+    (out / "tradeoff.png").unlink()
     monkeypatch.setattr(clip_study, "study", lambda *_, **__: pytest.fail("was studied first"))
     capsys.readouterr()
     assert main(words) == 2
