@@ -119,10 +119,29 @@ def _mean_square(variance: Array, frames: int) -> float:
 def _room(stack: FrameStatistics, bits: int, afterpulsing: float) -> Array:
     """Return the share of afterpulses that show in a code [H, W]: those of planes that had not fired."""
     if bits > 1:
-        below = float(stack.histogram[:-1].sum() / stack.histogram.sum())
-        return np.full(stack.total.shape, max(below, _LEAST) ** 0.5)
+        return np.full(stack.total.shape, _shown(stack))
     mean = stack.total / stack.frames
     return np.asarray((1 - mean) / (1 - afterpulsing * mean))
+
+
+def _shown(stack: FrameStatistics) -> float:
+    """Return the covariance of clipped counts that one count of its cause gives, over their variance.
+
+    The cause N counts without limit, and the effect shows in codes c below the top: P(c < top) Cov(c, N) / Var(c). The
+    counts that the top code hides are those of a Poisson law of the same mean code.
+    """
+    from scipy.special import pdtr
+
+    top = stack.histogram.size - 1
+    full = float(stack.histogram[-1] / stack.histogram.sum())
+    if full == 0:
+        return 1.0
+    counts = np.linspace(0.0, 3.0 * np.sqrt(top + 1), 400)[1:] ** 2
+    above = 1 - pdtr(np.arange(top), counts[:, None])  # P(N > k)
+    codes = above.sum(axis=1)
+    hidden = np.interp(stack.mean, codes, (counts - codes) / np.maximum(above[:, -1], 1e-300))
+    ratio = 1 + (top - stack.mean) * full * float(hidden) / max(stack.variance, 1e-12)
+    return max((1 - full) * ratio, _LEAST)
 
 
 def _crosstalk(stack: FrameStatistics, bits: int, value: float) -> _Pairs | None:
@@ -140,8 +159,7 @@ def _crosstalk(stack: FrameStatistics, bits: int, value: float) -> _Pairs | None
         room = 1 - mean
     else:
         fired = variance / (1 + NEIGHBOURS * max(value, 0.0))
-        below = float(stack.histogram[:-1].sum() / stack.histogram.sum())
-        room = np.full_like(mean, max(below, _LEAST) ** 0.25)
+        room = np.full_like(mean, np.sqrt(_shown(stack)))
     for products, first, second in (
         (stack.adjacent[0, :-1], np.s_[:-1, :], np.s_[1:, :]),
         (stack.adjacent[1, :, :-1], np.s_[:, :-1], np.s_[:, 1:]),

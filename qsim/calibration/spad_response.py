@@ -94,8 +94,13 @@ class Response:
         codes = np.arange(self.levels, dtype=float)
         mean = pmf @ codes
         found = pmf @ codes**2 - mean**2
-        if self.bits > 1:
-            found = found - (self.afterpulsing**2 + NEIGHBOURS * self.crosstalk**2) * np.maximum(mean - found, 0)
+        if self.bits > 1 and self.ratio > 0 and self.correlated:
+            counted = self._unclipped.cdf(np.maximum(arrivals, 0.0), 1.0)
+            above = 1 - counted
+            level = above.sum(axis=-1)
+            spread = (above * (2 * np.arange(above.shape[-1]) + 1)).sum(axis=-1) - level**2
+            shown = pmf[:, :-1].sum(axis=1) ** 2  # of a small change of the variance, below the top code
+            found = found - (self.afterpulsing**2 + NEIGHBOURS * self.crosstalk**2) * (level - spread) * shown
         return np.asarray(found)
 
     def table(self, largest: float) -> tuple[Array, Array]:
@@ -172,9 +177,13 @@ class Response:
     def _counter(self, bits: int) -> CountingSPAD:
         return CountingSPAD(1.0, 0.0, self.ratio, bits, self.paralyzable)
 
+    @property
+    def _unclipped(self) -> CountingSPAD:
+        return self._counter(max(self.bits, 8))
+
     def _extra(self, arrivals: Array) -> Array:
         """Return the mean number of afterpulses and crosstalk counts in a frame: [p] -> [p]."""
-        counted = arrivals if self.ratio == 0 else _mean_count(self._counter(max(self.bits, 8)), arrivals)
+        counted = arrivals if self.ratio == 0 else _mean_count(self._unclipped, arrivals)
         spread = 1 + NEIGHBOURS * self.crosstalk
         return np.asarray(counted * (spread / (1 - self.afterpulsing * spread) - 1))
 
