@@ -2,69 +2,108 @@
 
     load(family, seed, speed) -> the scene, and {file: SHA-256}
 
+* Python: the file, the modules of the user that it imports, the files that the scene's records name (a texture), and
+  those that the file declares, beside it or by absolute names:
+
+      reads = ["numbers.txt", "meshes/*.obj"]
+
+  With a pattern the names of all files that match it count, too: another mesh may be the one that a seed picks.
 * Mitsuba XML: each file that an attribute names, in this file and in those that it includes.
-* Python: modules that it imports, files that it opens while the scene is made, and files that the scene names. If it
-  lists a folder and opens files in it, the names of all files with these endings count too (`meshes/*.obj`).
 * A folder of assets: every file in it.
 
-Names are relative to the scene's file; files outside its folder have absolute names. Installed packages, this program,
-caches and the system's /proc, /sys and /dev are left out, but for files of users in /dev/shm. Families of the library
-read no files of the user.
+Names are relative to the scene's file; files outside its folder have absolute names. Installed packages, this program
+and caches are left out. Families of the library read no files of the user.
 """
 
 from __future__ import annotations
 
 import ast
 import contextlib
-import dataclasses
 import os
 import re
 import sys
 import sysconfig
-from collections.abc import Iterator
-from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from qsim import backend, files, scenes
+from qsim import files, scenes
 from qsim.dataset.provenance import nested
-from qsim.rendering import engine
 from qsim.scene import Scene
 
 _INSTALLED = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
-_LEFT_OUT = tuple(
-    f"{os.path.realpath(folder)}{os.sep}" for folder in (*_INSTALLED, str(Path(__file__).parents[1]), "/proc", "/sys")
-)
-_DEVICES, _SHARED = "/dev/", "/dev/shm/"  # the second holds files of users
+_LEFT_OUT = tuple(f"{os.path.realpath(folder)}{os.sep}" for folder in (*_INSTALLED, str(Path(__file__).parents[1])))
 _LIBRARY = Path(scenes.__file__).resolve().parent
 MOST_FOLDERS, MOST_FILES = 100, 10_000  # of one Mitsuba scene
-_PARTS_LEFT_OUT = frozenset({".cache", "site-packages", "dist-packages"})
+_PARTS_LEFT_OUT = frozenset({".cache", "site-packages", "dist-packages", "__pycache__"})
 
 
 def load(
     family: str | Path, seed: int = 0, speed: float = 1.0, *, along_path: bool = False, bands: str | None = None
 ) -> tuple[Scene, dict[str, str]]:
-    """Load a scene as `scenes.load` does, with the SHA-256 of each file read; empty for a family of the library."""
+    """Load a scene as `scenes.load` does, with the SHA-256 of each file read; empty for a family of the library.
+
+    `ValueError` for a Python file whose `reads` is no list of texts, or names a file that does not exist.
+    """
     path = Path(family).resolve()
     if str(family) in scenes.FAMILIES or not path.exists():
         return scenes.load(family, seed, speed, along_path=along_path, bands=bands), {}
-    with _tracing() as trace:
-        scene = scenes.load(family, seed, speed, along_path=along_path, bands=bands)
+    declared = _declared(path) if path.suffix == ".py" else {}
+    known = set(sys.modules)
+    scene = scenes.load(family, seed, speed, along_path=along_path, bands=bands)
+    if path.is_dir():
+        found = {file for file in path.rglob("*") if file.is_file()}
+        return scene, {_name(file, path): _digest(file) for file in sorted(found)}
     if path.suffix == ".xml":
         found = of_xml(path)
-    elif path.is_dir():
-        found = {file for file in path.rglob("*") if file.is_file()}
     else:
-        found = {path, *trace.opened, *_named_in(scene)}
-        if path.suffix == ".py":
-            found |= _imported(path)
-    for file in [file for file in found if file.suffix == ".xml"]:
-        found |= of_xml(file)
-    kept = sorted(file for file in found if file.is_file() and (path.is_dir() or file == path or _counts(file)))
-    listed = {file.parent / f"*{file.suffix}" for file in kept if path.suffix == ".py" and file.parent in trace.listed}
-    root = path if path.is_dir() else path.parent
-    return scene, {_name(file, root): _digest(file) for file in sorted({*kept, *listed})}
+        found = {path, *_imported(path), *_named_in(scene)}
+        _forget(set(sys.modules) - known)
+        for file in [file for file in found if file.suffix == ".xml"]:
+            found |= of_xml(file)
+    found = {file for file in found if file.is_file() and (file == path or _counts(file))}
+    for pattern, matching in declared.items():
+        found |= matching
+        if "*" in pattern.name:
+            found.add(pattern)
+    return scene, {_name(file, path.parent): _digest(file) for file in sorted(found)}
+
+
+def _declared(path: Path) -> dict[Path, set[Path]]:
+    """Return the files that match each entry of `reads` in a Python file."""
+    return {path.parent / entry: _matching(path, entry) for entry in _reads(path)}
+
+
+def _reads(path: Path) -> list[str]:
+    """Return the list `reads` of a Python file as it is written, without running it; empty if it has none."""
+    try:
+        body = ast.parse(path.read_bytes()).body
+    except (SyntaxError, OSError, ValueError):
+        return []  # the loader reports the error
+    for node in body:
+        if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["reads"]:
+            try:
+                entries = ast.literal_eval(node.value)
+            except ValueError:
+                entries = None
+            if not isinstance(entries, list | tuple) or not all(isinstance(entry, str) for entry in entries):
+                raise ValueError(
+                    f'{path}, line {node.lineno}: reads is a list of names, written out, as in reads = ["a.obj"]'
+                )
+            return list(entries)
+    return []
+
+
+def _matching(path: Path, entry: str) -> set[Path]:
+    """Return the files that one entry of `reads` names."""
+    pattern = path.parent / entry
+    if "*" in pattern.name:
+        found = {file for file in pattern.parent.glob(pattern.name) if file.is_file()}
+    else:
+        found = {pattern} if pattern.is_file() else set()
+    if not found:
+        raise ValueError(f"{path}: reads names {entry!r}, and there is no such file beside it")
+    return found
 
 
 def change(family: str, name: str, digest: str) -> str | None:
@@ -126,73 +165,11 @@ def _plain(folder: Path) -> Path:
     return Path(os.path.normpath(folder))
 
 
-@dataclasses.dataclass
-class _Trace:
-    """Files that Python code of this process opened for reading, and folders that it listed."""
-
-    opened: set[Path] = dataclasses.field(default_factory=set)
-    listed: set[Path] = dataclasses.field(default_factory=set)
-
-
-_active: ContextVar[_Trace | None] = ContextVar("active", default=None)
-_hooks: list[object] = []  # an audit hook cannot be removed, so only one is added
-_own_modules: set[str] = set()  # imported by scenes of the user; the next scene imports them again, and is traced
-
-
-@contextlib.contextmanager
-def _tracing() -> Iterator[_Trace]:
-    """Record what a scene opens, lists and imports inside the block."""
-    if not _hooks:
-        _hooks.append(_see)
-        sys.addaudithook(_see)
-    for name in _own_modules:
-        sys.modules.pop(name, None)
-    before = set(sys.modules)
-    token = _active.set(trace := _Trace())
-    try:
-        yield trace
-    finally:
-        _active.reset(token)
-        for name in set(sys.modules) - before:
-            file = getattr(sys.modules[name], "__file__", None)
-            if file and _counts(Path(file).resolve()):
-                _own_modules.add(name)
-                trace.opened.add(Path(file).resolve())
-
-
-def _see(event: str, arguments: tuple[Any, ...]) -> None:
-    """Record, as an audit hook, files that a scene opens or lists while it is made; omit imports and the renderer."""
-    if event not in ("open", "os.listdir", "os.scandir") or (trace := _active.get()) is None:
-        return
-    with contextlib.suppress(Exception):  # a hook that raises would stop the scene
-        path = Path(os.path.realpath(os.fsdecode(arguments[0])))
-        if not _counts(path) or _for_itself():
-            return
-        if event != "open":
-            trace.listed.add(path)
-        elif not arguments[2] & (os.O_WRONLY | os.O_RDWR):
-            trace.opened.add(path)
-
-
-def _for_itself() -> bool:
-    """Return whether Python's importer or the choice of a backend opens the file, not the user's scene."""
-    frame = sys._getframe(2)
-    while frame is not None:
-        name = frame.f_code.co_filename
-        if name.startswith("<frozen importlib") or name in (backend.__file__, engine.__file__):
-            return True
-        if not name.startswith("<") and _counts(Path(os.path.realpath(name))):
-            return False
-        frame = frame.f_back  # type: ignore[assignment]
-    return False
-
-
 def _counts(path: Path) -> bool:
     """Return whether a file belongs to the user."""
-    device = str(path).startswith(_DEVICES) and not str(path).startswith(_SHARED)
-    if device or str(path).startswith(_LEFT_OUT) or not _PARTS_LEFT_OUT.isdisjoint(path.parts):
+    if str(path).startswith(_LEFT_OUT) or not _PARTS_LEFT_OUT.isdisjoint(path.parts):
         return False
-    return "__pycache__" not in path.parts and not (path.parent == _LIBRARY and path.suffix == ".py")
+    return not (path.parent == _LIBRARY and path.suffix == ".py")
 
 
 def _imported(path: Path, found: set[Path] | None = None) -> set[Path]:
@@ -206,11 +183,25 @@ def _imported(path: Path, found: set[Path] | None = None) -> set[Path]:
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
             if isinstance(node, ast.ImportFrom):
                 names = [node.module or "", *(f"{node.module}.{name}" for name in names)]
-            for name in names:
-                file = getattr(sys.modules.get(name), "__file__", None)
+            for module in {part for name in names for part in _packages(name)}:
+                file = getattr(sys.modules.get(module), "__file__", None)
                 if file and _counts(Path(file).resolve()):
                     _imported(Path(file).resolve(), found)
     return found
+
+
+def _packages(name: str) -> list[str]:
+    """Return a module's name after those of the packages that it lies in: a, a.b, a.b.c."""
+    parts = name.split(".")
+    return [".".join(parts[: n + 1]) for n in range(len(parts))]
+
+
+def _forget(names: set[str]) -> None:
+    """Forget the user's modules among these: a scene in another folder may have others of the same names."""
+    for name in names:
+        file = getattr(sys.modules.get(name), "__file__", None)
+        if file and _counts(Path(file).resolve()):
+            del sys.modules[name]
 
 
 def _named_in(scene: Any) -> set[Path]:

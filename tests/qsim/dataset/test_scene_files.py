@@ -2,9 +2,9 @@
 
 import os
 import random
+import re
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import pytest
 from clips import write_clip
 from fakes import RECIPE, tree
 
-from qsim import files
+from qsim import files, scenes
 from qsim.dataset import job_runner, provenance, recipe, scene_files
 from qsim.dataset.generation import Options, generate
 from qsim.dataset.job import Job
@@ -33,6 +33,7 @@ sys.path.remove(str(HERE))
 
 from qsim import scenes
 
+reads = ["numbers.txt", "data.csv", "meshes/*.obj", "seed0.bin", "seed1.bin"]
 NUMBERS = (HERE / "numbers.txt").read_text()
 
 
@@ -85,26 +86,65 @@ def make(job: Job, path: Path) -> object:
     return write_clip(path, frames=1, height=2, width=3, seed=job.scene_seed, **provenance.origin(job, read))
 
 
-def test_a_python_scene_names_all_that_it_reads_every_time(place: Path):
+def test_a_python_scene_names_all_that_it_declares_and_imports_every_time(place: Path):
     path = write_scene(place)
     for seed in (0, 1, 0):
         _, read = scene_files.load(str(path), seed)
-        expected = {name for name in READ if not name.startswith(("seed", "meshes"))}
-        assert set(read) == expected | {f"seed{seed}.bin", f"meshes/{'ab'[seed]}.obj", "meshes/*.obj"}
+        assert set(read) == {*READ, "meshes/*.obj"}
         assert all(files.sha256(place / name) == digest for name, digest in read.items() if "*" not in name)
 
 
-@pytest.mark.skipif(not os.access("/dev/shm", os.W_OK), reason="no shared memory")
-def test_files_in_shared_memory_are_the_users():
-    """All of /dev was left out, so that edits of a scene kept there were not seen."""
-    with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
-        path = Path(folder) / "wheel.py"
-        path.write_text(
-            "from pathlib import Path\nfrom qsim import scenes\n\n\ndef scene(seed=0, speed=1.0):\n"
-            "    Path(__file__).with_name('a.txt').read_text()\n    return scenes.load('fan', seed, speed)\n"
+def small_scene(folder: Path, line: str) -> Path:
+    """Write a scene of one line beside a text."""
+    folder.mkdir(exist_ok=True)
+    (folder / "a.txt").write_text("1")
+    (folder / "wheel.py").write_text(
+        f"from qsim import scenes\n{line}\n\n\n"
+        "def scene(seed=0, speed=1.0):\n    return scenes.load('fan', seed, speed)\n"
+    )
+    return folder / "wheel.py"
+
+
+def test_files_elsewhere_are_declared_by_absolute_or_relative_names(tmp_path: Path):
+    (tmp_path / "shared.txt").write_text("2")
+    lines = {f"reads = ['a.txt', {str(tmp_path / 'shared.txt')!r}]": str(tmp_path / "shared.txt")}
+    lines["reads = ('a.txt', '../shared.txt')"] = "../shared.txt"
+    for line, name in lines.items():
+        path = small_scene(tmp_path / "scene", line)
+        read = scene_files.load(path)[1]
+        assert set(read) == {"wheel.py", "a.txt", name}
+        assert scene_files.change(str(path), name, read[name]) is None
+        assert "was changed" in scene_files.change(str(path), name, "0" * 64)
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("reads = ['b.txt']", "reads names 'b.txt', and there is no such file beside it"),
+        ("reads = ['*.obj']", "reads names '*.obj', and there is no such file beside it"),
+        ("reads = [str(n) for n in range(3)]", "line 2: reads is a list of names, written out"),
+        ("reads = 'a.txt'", "line 2: reads is a list of names, written out"),
+        ("reads = ['a.txt', 3]", "line 2: reads is a list of names, written out"),
+    ],
+)
+def test_a_wrong_declaration_is_refused(tmp_path: Path, line: str, told: str):
+    with pytest.raises(ValueError, match=re.escape(told)):
+        scene_files.load(small_scene(tmp_path / "scene", line))
+
+
+def test_two_scenes_with_helpers_of_one_name_have_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The second scene imported the helper of the first, which stayed in memory."""
+    for name, blades in (("one", 3), ("two", 5)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "reads_blades.py").write_text(f"BLADES = {blades}\n")
+        (tmp_path / name / "wheel.py").write_text(
+            "import sys\nfrom pathlib import Path\nsys.path.insert(0, str(Path(__file__).parent))\n"
+            "import reads_blades\nsys.path.pop(0)\nfrom qsim import scenes\n\n\n"
+            "def scene(seed=0, speed=1.0):\n    return scenes.load('fan', reads_blades.BLADES, speed)\n"
         )
-        (path.parent / "a.txt").write_text("1")
-        assert set(scene_files.load(path)[1]) == {"wheel.py", "a.txt"}
+        made, read = scene_files.load(tmp_path / name / "wheel.py")
+        assert set(read) == {"wheel.py", "reads_blades.py"}
+        assert made.to_dict() == scenes.load("fan", blades).to_dict()
 
 
 def test_the_package_is_not_the_users_wherever_it_lies(monkeypatch):
