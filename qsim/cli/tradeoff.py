@@ -56,6 +56,9 @@ def add_tradeoff(sub: Any) -> None:
         help=f"sensor of a binary plane (default: a clocked SPAD of the same efficiency): {files_of}; another QIS file "
         "if it has 1 bit",
     )
+    parser.add_argument(
+        "--temperature", type=float, help="degrees C of sensor files with dark_doubling (default: the file's own)"
+    )
     parser.add_argument("--instants", type=count, help="frames drawn and scored per depth (default 8)")
     parser.add_argument("--frames", type=count, help="frames of a rendered scene (default: enough for the instants)")
     seed = checked(checks.seed)
@@ -66,7 +69,7 @@ def add_tradeoff(sub: Any) -> None:
 
 
 TABLE_ONLY = ("read_noise", "motion")
-OF_STUDIES = ("px", "ppp", "bits", "base_fps", "sensor", "plane_sensor", "instants", "frames", "streams")
+OF_STUDIES = ("px", "ppp", "bits", "base_fps", "sensor", "plane_sensor", "temperature", "instants", "frames", "streams")
 PICTURES = {"tradeoff": ("best.png", "tradeoff.png")}  # of a study: which of them depends on its size
 OF_FILES = ("seed", "speed", "output", "force")
 
@@ -115,7 +118,9 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
 
     bits, instants = tuple(args.bits or (1, 2, 3, 4, 5)), 8 if args.instants is None else args.instants
     sensor = args.sensor or "quiver-physical"
-    settings = StudySettings(bits, sensor, args.plane_sensor, None, 1, instants, args.seed, moving=bool(args.px))
+    settings = StudySettings(
+        bits, sensor, args.plane_sensor, None, 1, instants, args.seed, bool(args.px), args.temperature
+    )
     study_clips.check_sensors(settings, args.streams)  # before anything is rendered
     height, width = args.size or (96, 128)
     widen = args.bits is None

@@ -161,7 +161,8 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings, *, force: b
         path = stream_clip(clip, folder, bits, force)
         read = Sensing(settings.sensor, bits, ppp=m * level.ppp, seed=settings.seed, name="multibit")
         if settings.sensor.endswith(".toml"):  # read at every depth, which the file does not state
-            read = replace(read, sensor=at_depth(settings.sensor, bits, m * level.ppp, m * clip.exposure))
+            depth = at_depth(settings.sensor, bits, m * level.ppp, m * clip.exposure, settings.temperature)
+            read = replace(read, sensor=depth)
         grouped = group(clip, path, m, force=force)
         sense(grouped, read)
         key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))

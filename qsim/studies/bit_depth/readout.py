@@ -15,6 +15,7 @@ from numpy import ndarray as Array
 from qsim.sensor import colour_filter, devices
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
+from qsim.sensor.file_laws import Conditions
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
@@ -36,6 +37,7 @@ class StudySettings:
     instants: int = 8  # largest number of output frames that are drawn and scored
     seed: int = 0
     moving: bool = False  # score the pixels that move at the scored instant, not the whole frame
+    temperature: float | None = None  # degrees C of sensor files with dark_doubling; None: that of the file
 
     def __post_init__(self) -> None:
         if not self.bits or not all(1 <= b <= 10 for b in self.bits):
@@ -44,6 +46,11 @@ class StudySettings:
             if getattr(self, name) < 1:
                 raise ValueError(f"tradeoff: {name} must be a whole number of at least 1, got {getattr(self, name)}")
         object.__setattr__(self, "bits", tuple(sorted(set(self.bits))))
+        if self.temperature is not None and not any(_is_file(name) for name in (self.sensor, self.plane or "")):
+            raise ValueError(
+                f"tradeoff: temperature {self.temperature:g}: {self.sensor} has no law of temperature; name a sensor "
+                "file with dark_doubling, or leave the temperature out"
+            )
 
     @property
     def longest(self) -> int:
@@ -114,16 +121,20 @@ class Readout:
         return replace(self, sensor=replace(self.sensor, read_noise=0.0)) if isinstance(self.sensor, QIS) else self
 
 
-def at_depth(name: str, bits: int, ppp: float, exposure: float) -> Sensor:
+def _is_file(name: str) -> bool:
+    return name.endswith(".toml")
+
+
+def at_depth(name: str, bits: int, ppp: float, exposure: float, temperature: float | None = None) -> Sensor:
     """Return a named sensor, or that of a file, with so many bits at `ppp` photons per pixel and exposure.
 
     A file of a SPAD, or of a QIS with gain 1 and no offset, is taken at every depth. `ValueError` for another file
     whose sensor has other bits, because gain and offset belong to them. Spike cameras, defects and colour filters are
-    refused, too.
+    refused, too. `temperature` [degrees C] is that of a file; a named sensor has one.
     """
-    if not name.endswith(".toml"):
+    if not _is_file(name):
         return devices.load(name, ppp=ppp, bits=bits, exposure=exposure)
-    sensor = _of_file(name)
+    sensor = _of_file(name, bits, temperature)
     if isinstance(sensor, BinarySPAD | CountingSPAD):
         return replace(sensor, bits=bits)
     if isinstance(sensor, QIS) and (sensor.gain, sensor.offset) == (1.0, 0.0):
@@ -136,9 +147,12 @@ def at_depth(name: str, bits: int, ppp: float, exposure: float) -> Sensor:
     return sensor
 
 
-def _of_file(name: str) -> Sensor:
-    """Return the sensor of a file; `ValueError` for what the laws of this study do not hold for."""
-    sensor = devices.load(name)
+def _of_file(name: str, bits: int, temperature: float | None) -> Sensor:
+    """Return the sensor of a file; `ValueError` for what the laws of this study do not hold for.
+
+    `bits` are those of a file that states none.
+    """
+    sensor = devices.from_toml(name, bits, Conditions(temperature))
     if isinstance(sensor, SpikeCamera):
         raise ValueError(
             f"{name}: planes of a spike camera depend on each other, which this study does not model; name another "
@@ -160,10 +174,12 @@ def plane_sensor(settings: StudySettings, ppp: float, exposure: float) -> Sensor
     where this read has dark electrons per frame, so that no plane has its rate.
     """
     if settings.plane is not None:
-        return at_depth(settings.plane, 1, ppp, exposure)
-    file = settings.sensor.endswith(".toml")
+        return at_depth(settings.plane, 1, ppp, exposure, settings.temperature)
+    file = _is_file(settings.sensor)
     read, longer = (
-        _of_file(settings.sensor) if file else devices.load(settings.sensor, ppp=ppp, exposure=seconds)
+        _of_file(settings.sensor, settings.bits[0], settings.temperature)
+        if file
+        else devices.load(settings.sensor, ppp=ppp, exposure=seconds)
         for seconds in (exposure, 2 * exposure)
     )
     if read.dark_rate != longer.dark_rate:
@@ -180,5 +196,6 @@ def readouts(settings: StudySettings, ppp: float, exposure: float) -> list[Reado
     result = [Readout("planes", b, plane, exposure) for b in settings.bits]
     for b in settings.bits:
         m = 2**b - 1
-        result.append(Readout("multibit", b, at_depth(settings.sensor, b, m * ppp, m * exposure), m * exposure))
+        read = at_depth(settings.sensor, b, m * ppp, m * exposure, settings.temperature)
+        result.append(Readout("multibit", b, read, m * exposure))
     return result

@@ -458,6 +458,10 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Acts(STUDY, "--plane-sensor spad-320x240", stdout),
         Refused("tradeoff --table", "--plane-sensor x", "--plane-sensor"),
     ],
+    ("tradeoff", "--temperature"): [
+        Refused(STUDY, "--temperature 20", "no law of temperature"),
+        Refused("tradeoff --table", "--temperature 20", "--temperature"),
+    ],
     ("tradeoff", "--instants"): [
         Acts(STUDY, "--instants 1", stdout, codes=(0, 2)),
         Refused("tradeoff --table", "--instants 2", "--instants"),

@@ -38,6 +38,19 @@ def test_a_sensor_file_is_read_at_every_depth(tmp_path, text):
     assert (plane.bits, plane.efficiency) == (1, 0.3)
 
 
+def test_a_temperature_doubles_the_dark_rate_of_both_reads(tmp_path):
+    """Two doublings, of a file that states no bits."""
+    file = tmp_path / "warm.toml"
+    own = SPAD.replace("bits = 4\n", "")
+    assert "bits" not in own
+    file.write_text(f"{own}dark_doubling = 8.0\ndark_reference = 25.0\n")
+    settings = StudySettings(bits=(2,), sensor=str(file), temperature=41.0)
+    planes, multibit = readouts(settings, 0.65, 1e-4)
+    assert planes.sensor.dark_rate == multibit.sensor.dark_rate == 100.0
+    with pytest.raises(ValueError, match="temperature 41: quiver-physical has no law of temperature"):
+        StudySettings(temperature=41.0)
+
+
 @pytest.mark.parametrize("own", ["gain = 1.08\n", "offset = 2.0\n", "full_well = 100.0\niso = 400\n"])
 def test_a_gain_belongs_to_the_bits_of_its_file(tmp_path, own):
     """The refusal names the depth at which the file is taken."""
