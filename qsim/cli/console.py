@@ -242,7 +242,7 @@ def _run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
         if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in _PACKAGES:
             raise
         if os.environ.get("QSIM_DEBUG") or args.verbose:
-            traceback.print_exc()
+            print(printable(traceback.format_exc()), end="", file=sys.stderr)
         return failed(f"{parser.prog}: {one_line(error)}", 2, args.json)
     except KeyboardInterrupt:
         return failed(f"\n{parser.prog}: interrupted; {_then(args)}", 130, args.json)

@@ -22,7 +22,7 @@ import numpy as np
 from qsim.cli.console import OPTIONAL, RESUMES, command, failed, output
 from qsim.cli.options import check_free
 from qsim.files import to_json, write_bytes, write_json
-from qsim.terminal import is_lost
+from qsim.terminal import is_lost, printable
 
 MEASUREMENTS = Path(__file__).parents[1] / "measurements"
 MARK = "demo.json"  # marks a folder as one that this command fills
@@ -101,7 +101,7 @@ def steps(out: Path, quiet: bool) -> None:
         """Run one command; its progress goes to the terminal."""
         words = [str(word) for word in (*arguments, *(["--quiet"] if quiet else []))]
         if not quiet:
-            print(f"\n{what}\n  $ {program} {shlex.join(words)}", flush=True)
+            print(printable(f"\n{what}\n  $ {program} {shlex.join(words)}"), flush=True)
         return call([sys.executable, "-m", program, *words], capture or quiet)
 
     def restore(source: Path, target: Path, method: str) -> None:

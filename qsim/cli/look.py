@@ -13,7 +13,7 @@ from typing import Any
 from qsim import files
 from qsim.cli.console import bar, command, output, refuse_existing, refuse_idle
 from qsim.clip.manifest import check_outside
-from qsim.terminal import is_lost
+from qsim.terminal import is_lost, printable
 
 PREVIEWS = (".mp4", ".gif", ".png")
 FASTEST_GIF = 50  # frames per second; viewers slow down faster ones
@@ -129,7 +129,7 @@ def _show(args: argparse.Namespace, source: Any, views: list[Any], frames: range
         if view.legend is not None:
             print(draw(preview.fit_terminal(view.legend, 24, 12)))
         stretched = "" if coloured else ", contrast stretched"
-        print(f"frame {frames[-1]} of {source.name}, {view.declared}{stretched}")
+        print(printable(f"frame {frames[-1]} of {source.name}, {view.declared}{stretched}"))
     return 0
 
 

@@ -31,6 +31,7 @@ from qsim.clip.manifest import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.scene.image_files import read_grey
 from qsim.scene.textures import noise, pictures_in
+from qsim.terminal import printable
 
 FINE = 2  # texels of a layer per pixel, at zoom 1
 SAMPLES = 3  # per pixel along each side
@@ -299,12 +300,12 @@ def main(words: Sequence[str] | None = None) -> int:
             raise ValueError(f"--motion: expected 0 to 100 px/frame, got {args.motion!r}")
         made = make(args.output, args.pictures, args.licence, args)
     except (ValueError, OSError) as error:
-        print(f"warped_pictures: {files.wording(error)}", file=sys.stderr)
+        print(printable(f"warped_pictures: {files.wording(error)}"), file=sys.stderr)
         return 2
     numbers = range(args.first, args.first + args.clips)
     others = sum(Clip.open(clip_path(args.output, n)).meta.get("split") != args.split for n in numbers)
     kept = f"; {others} of these keep another split than {args.split}" if others else ""
-    print(f"{args.output}: {made} clips made, {args.clips - made} were there{kept}")
+    print(printable(f"{args.output}: {made} clips made, {args.clips - made} were there{kept}"))
     return 0
 
 

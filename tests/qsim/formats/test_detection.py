@@ -249,3 +249,31 @@ def test_a_cube_of_ours_keeps_its_orientation(tmp_path: Path):
     (tmp_path / "c.npy.json").write_text(json.dumps(about))
     found = importing.read(tmp_path / "c.npy")
     assert (found.shape, found.meta["orientation"]) == ((3, 4, 13), "as stored")
+
+
+@pytest.mark.parametrize("bits", ["big", "little"])
+@pytest.mark.parametrize(("light", "frames"), [(0.02, 3), (0.3, 8), (0.9, 2)])
+def test_noise_that_hides_a_layout_is_named(tmp_path, bits, light, frames):
+    """1-bit planes of 512 x 512 pixels in either order of bits: never a wrong layout, and never 'near 1' for one."""
+    rng = np.random.default_rng(frames)
+    scene = light * (1 + 0.5 * np.sin(np.arange(512) / 40) * np.cos(np.arange(512)[:, None] / 30)) / 1.5
+    planes = (rng.random((frames, 512, 512)) < scene).astype(np.uint8)
+    path = tmp_path / "noisy.bin"
+    path.write_bytes(np.packbits(planes, axis=2, bitorder=bits).tobytes())
+    with pytest.raises(ValueError, match=r"fit swissspad2-half .*these frames are too noisy or too rough to tell"):
+        detection.detect(path)
+
+
+@pytest.mark.parametrize(("bits", "layout"), [("big", "spad512s"), ("little", "swissspad2-full")])
+def test_the_smoothest_layout_is_the_true_one(tmp_path, bits, layout):
+    """Fine texture that noise does not hide: only the true order of bits is smooth."""
+    rng = np.random.default_rng(0)
+    scene = np.where(np.arange(512) // 4 % 2 == 0, 0.05, 0.9) * np.ones((512, 1))
+    planes = (rng.random((32, 512, 512)) < scene).astype(np.uint8)
+    path = tmp_path / "texture.bin"
+    path.write_bytes(np.packbits(planes, axis=2, bitorder=bits).tobytes())
+    with pytest.raises(ValueError, match="choose one with --layout") as refused:
+        detection.detect(path)
+    found = dict(re.findall(r"(\S+) \(roughness ([0-9.]+)\)", str(refused.value)))
+    least = min(found, key=lambda name: float(found[name]))
+    assert least == layout or "too rough to tell" in str(refused.value)
