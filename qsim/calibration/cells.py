@@ -93,7 +93,18 @@ def _groups(darks: Sequence[Array], flats: Sequence[Array], light: Array) -> lis
         noise = sqrt(float(codes.astype(float).var(axis=0, ddof=1).mean()))
         wanted = max(wanted, contrast * (float(codes.mean()) - base) / (WIDTH * max(noise, 1e-9)))
     count = max(1, min(ceil(wanted), MOST_GROUPS, light.size // LEAST_PIXELS))
-    return np.array_split(np.argsort(light, kind="stable"), count)
+    return _of_equal_width(light, count)
+
+
+def _of_equal_width(light: Array, count: int) -> list[Array]:
+    """Return groups of pixels that span equal ranges of light; one of few pixels joins the next brighter one."""
+    order = np.argsort(light, kind="stable")
+    ends = np.searchsorted(light[order], np.linspace(light.min(), light.max(), count + 1)[1:-1])
+    kept: list[int] = []
+    for end in ends:
+        if end - (kept[-1] if kept else 0) >= LEAST_PIXELS and light.size - end >= LEAST_PIXELS:
+            kept.append(int(end))
+    return np.split(order, kept)
 
 
 def good_pixels(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics]) -> Array:

@@ -43,7 +43,14 @@ def chi_square(histograms: Iterable[tuple[Array, Array]], fitted: int, total: fl
 
 def pooled(observed: Array, expected: Array, least: float = 5.0) -> tuple[Array, Array]:
     """Join neighbouring bins until each expects at least `least`; return observed and expected counts."""
-    last = max(observed.sum() // least - 1, 0)  # whole counts: rounding of the expected sum must not join two bins
-    group = np.minimum(np.floor(np.cumsum(expected) / least), last).astype(int)
-    _, group = np.unique(group, return_inverse=True)
+    enough = least - 1e-9 * float(expected.sum())  # rounding of the expected sum must not join two bins
+    group = np.zeros(len(expected), dtype=int)
+    number, inside = 0, 0.0
+    for i, count in enumerate(expected.tolist()):
+        group[i] = number
+        inside += count
+        if inside >= enough:
+            number += 1
+            inside = 0.0
+    group[group == number] = max(number - 1, 0)  # what is left at the end joins the last bin
     return np.bincount(group, observed), np.bincount(group, expected)

@@ -22,7 +22,7 @@ RISE = 0.18  # of the limit of the root per standard deviation from the bound, u
 CLOSE = 0.03  # to which the root is met, relative
 SHARP = 0.5  # codes of read noise; below, the likelihood has several maxima
 WIDEST = 10.0  # most variance between pixels, relative to that of the likelihood
-HIGHER = 0.02  # of a log likelihood; less is the error of a maximum
+HIGHER = 0.05  # of a log likelihood; less is the error of a maximum
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from qsim.sensor.qis import QIS
 
 METHOD = "likelihood of the codes"
 MOST_OPEN = 2.0  # most high end over low end of the gain, for which electrons per photon are printed
-REPEATS = 5  # of a fit whose profile met a larger likelihood
+REPEATS = 15  # of a fit whose profile met a larger likelihood
 
 
 def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], *, bits: int) -> Calibration:

@@ -21,6 +21,7 @@ from qsim.calibration.histogram_fit import DARK, GAIN, NOISE, OFFSET, Fit
 FACTORS = np.geomspace(2, 40, 9)  # of the dark current
 WEAK = 5.0  # times the dark current, of the weakest hot pixel that is looked for
 SEEN = 6.0  # standard errors of a pixel's sum, above which it is seen
+MOST = 0.1  # of all pixels; a larger share is no share of hot pixels, but a law that does not describe the sums
 ROUNDS = 100  # of the fitted share
 SEED = 20  # of what is left out
 
@@ -51,6 +52,8 @@ def without_warm(fit: Fit, darks: Sequence[FrameStatistics], good: Array) -> Arr
     for _ in range(ROUNDS):
         hot = share * warm / ((1 - share) * chances[0] + share * warm)
         share = float(hot.mean())
+    if share > MOST:
+        return good
     used = good.copy()
     used[good] = np.random.default_rng(SEED).random(sums.size) >= hot
     return used

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
+from types import SimpleNamespace
 
+import numpy as np
+from scipy.stats import binom
+
+from qsim.calibration.cells import sum_limit
 from qsim.calibration.code_law import code_law
-from qsim.calibration.goodness import chi_square
+from qsim.calibration.goodness import chi_square, pooled
+from qsim.calibration.moment_law import ADC, MomentLaw
 from qsim.sensor.qis import QIS
 
 
@@ -18,6 +23,37 @@ def test_rounding_joins_no_bins():
         scaled = [shares * factor * histogram.sum() for factor in (1 - 1e-14, 1.0, 1 + 1e-14)]
         found = [chi_square([(histogram, expected)], 1) for expected in scaled]
         np.testing.assert_allclose(found, found[0], rtol=1e-9)
+
+
+def test_no_bin_expects_less_than_five():
+    """A bin of 0.007 before one of thousands stayed alone: one count in it called a right model wrong."""
+    observed, expected = pooled(np.array([1.0, 3000.0, 4.0, 2.0]), np.array([0.007, 3000.0, 4.5, 2.5]))
+    np.testing.assert_allclose(observed, [3001.0, 6.0])
+    np.testing.assert_allclose(expected, [3000.007, 7.0])
+
+
+def test_the_limit_of_a_sum_of_rare_codes_is_that_of_a_binomial():
+    """One electron in 250 codes: normal limits took every pixel with an electron for a hot one."""
+    for terms, chance in ((19, 1e-4), (400, 1e-6)):
+        assert sum_limit(np.array([0, 249, 1]), terms, chance) == terms + binom.isf(chance, terms, 1 / 250)
+
+
+def test_moments_of_a_bright_cell_have_the_slopes_of_their_differences():
+    cell = SimpleNamespace(codes=np.zeros((5, 9)), mean=130.0, variance=420.0, in_time=np.linspace(300, 500, 9))
+    law = MomentLaw([cell])
+    at = np.array([np.log(2.0), 10.0, np.log(3.0), 61.0])
+
+    def moments(p):
+        return law.laws(np.exp(p[0]), p[1], np.exp(p[2]), p[3:])
+
+    assert moments(at)[1] == 4 * (61 + 9) + ADC
+    slopes = law.slopes(2.0, 3.0, at[3:])
+    score = law.score(*moments(at), *slopes)
+    for k, step in enumerate(1e-5 * np.eye(4)):
+        above, below = moments(at + step), moments(at - step)
+        for slope, high, low in zip(slopes, above, below, strict=True):
+            np.testing.assert_allclose(slope[k], (high - low) / 2e-5, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(score[k].sum(), (law.value(*above) - law.value(*below)) / 2e-5, rtol=1e-4)
 
 
 def test_law_is_that_of_the_sensor():
