@@ -49,6 +49,10 @@ class Correlations:
         ):
             if chance.variance is not None:
                 found[name] = normal_interval(chance.value, chance.variance, unit, method, floor=0.0)
+        if "crosstalk" in found:
+            one = found["crosstalk"]
+            value, low, high = (1 - (1 - c) ** NEIGHBOURS for c in (one.value, one.low, one.high))
+            found["crosstalk_total"] = Value(value, low, high, "to any of four neighbours", "as data sheets state it")
         return found
 
 
