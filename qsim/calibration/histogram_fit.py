@@ -28,6 +28,7 @@ FINEST = 2.0  # bins in one standard deviation of the read noise
 MOST_BINS = 800
 STARTS = 10  # that are followed
 ROUGH = 20.0  # of the log likelihood, by which a rough maximum may be worse and is followed
+MOST_MODES = 3  # that are kept
 NEARLY = 5.0  # by which a maximum may be worse and is another possible answer
 APART = 0.1  # of the quadratic form of the information, between two maxima
 BESIDE = (-2, -1, 1, 2)  # e- of the brightest cell whose histogram is used, by which a gain is tried beside the best
@@ -364,7 +365,9 @@ def refined(likelihood: Likelihood, start: State, others: Sequence[State] = ()) 
         likelihood.set_response(likelihood.at(best.parameters))
         best = likelihood.maximise(best.parameters, enough=1e-10)
     modes: list[State] = []
-    for other in others:
+    for other in sorted(others, key=lambda state: state.value, reverse=True):
+        if len(modes) == MOST_MODES:
+            break
         if likelihood.value(other.parameters) < best.value - ROUGH:
             continue
         state = likelihood.maximise(other.parameters, enough=1e-5)

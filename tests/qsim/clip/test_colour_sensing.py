@@ -11,10 +11,12 @@ from qsim.cli import main
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
 from qsim.clip.rows import Rows
-from qsim.clip.sensing import Sensing, assemble, prepare, replay
+from qsim.clip.sensing import Sensing, assemble, prepare, replay, sense
 from qsim.clip.simulation import stored
+from qsim.dataset.recipe import load
 from qsim.dataset.redraw import redraw
 from qsim.keys import Key, hash_name
+from qsim.optics.radiometry import RGB
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
@@ -170,3 +172,50 @@ def test_a_recipe_names_its_filters(place):
         recipe.parse(head.replace('bands = "rgb"\n', "") + colour)
     with pytest.raises(ValueError, match=r"recipe\.toml:12: unknown colour filter array 'x'"):
         recipe.parse(head + '[[streams]]\nsensor = "quiver-physical"\nppp = 3\ncolour = "x"\n')
+
+
+CURVE = [[460e-9, 0.20], [540e-9, 0.50], [610e-9, 0.35]]
+WARM = f"""
+[sensor]
+model = "BinarySPAD"
+bits = 1
+dark_count_rate = 100.0
+dark_doubling = 8.0
+dark_reference = 25.0
+qe_curve = {CURVE}
+"""
+RECIPE = """
+[recipe]
+name = "warm"
+bands = "rgb"
+frames = 40
+height = 24
+width = 32
+frame_rate = 2000.0
+[[scenes]]
+family = "fan"
+seeds = [1]
+[[streams]]
+sensor = "warm.toml"
+colour = "rggb"
+ppp = 1.0
+temperature = 41.0
+"""
+
+
+def test_a_recipe_reads_a_curve_of_efficiency_and_a_temperature(tmp_path):
+    """Even light of one photon per band: means behind the filters follow the curve, and 400 dark counts per second.
+
+    A filter passes all light of its band, to the efficiency of the curve at the wavelength of the band. Four sigma.
+    """
+    (tmp_path / "warm.toml").write_text(WARM)
+    (tmp_path / "recipe.toml").write_text(RECIPE)
+    (wanted,) = load(tmp_path / "recipe.toml").jobs[0].streams
+    clip = write_clip(tmp_path / "c", radiance=np.ones((40, 3, 24, 32), np.float32), bands=list(RGB))
+    stream, _ = sense(clip, wanted)
+    assert stream.meta["temperature"] == 41.0
+    points, values = np.array(CURVE).T
+    for pixels, band in ((np.s_[::2, ::2], 0), (np.s_[::2, 1::2], 1), (np.s_[1::2, 1::2], 2)):
+        codes = stream.codes()[:, *pixels]
+        expected = -np.expm1(-(np.interp(RGB[band], points, values) + 400.0 * clip.exposure))
+        assert abs(codes.mean() - expected) < 4 * np.sqrt(expected * (1 - expected) / codes.size)
