@@ -29,8 +29,8 @@ def by_moments(cell: Cell, gain: float, bits: int) -> bool:
     ends = np.count_nonzero((cell.codes == 0) | (cell.codes == (1 << bits) - 1))
     if ends > CLIPPED * cell.codes.size or cell.variance < LEAST_VARIANCE:
         return False
-    electrons = cell.variance / max(1.0, gain**2)  # or codes, if a code is more than one electron
-    return electrons > BRIGHT or electrons * sqrt(2 / _freedom(cell)) > ERROR
+    error = cell.variance * sqrt(2 / _freedom(cell))
+    return cell.variance > BRIGHT * gain**2 or error > ERROR * max(1.0, gain**2)
 
 
 def _freedom(cell: Cell) -> int:
