@@ -161,17 +161,17 @@ def multiply_accumulates(method: Restorer, codes: Codes, first: int) -> float:
 
     A network that restores several frames at a time: those of such a part, divided by its frames.
     """
-    from torch.utils.flop_counter import FlopCounterMode
+    from quiver.evaluation.macs import MacCounter
 
     if method.together > 1:
-        with FlopCounterMode(display=False) as counter:
+        with MacCounter() as counter:
             method.restore(codes, first, first + method.together)
-        return counter.get_total_flops() / 2 / method.together
+        return counter.total / method.together
     counts = []
     for frames in (2, 3):
-        with FlopCounterMode(display=False) as counter:
+        with MacCounter() as counter:
             method.restore(codes, first, first + frames)
-        counts.append(counter.get_total_flops() / 2)
+        counts.append(counter.total)
     return counts[1] - counts[0]
 
 
