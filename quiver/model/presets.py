@@ -1,6 +1,7 @@
 """Makes networks by name: the presets, the ablations of the paper, the control, and the compared networks."""
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from quiver.model.rivals.rvrt import RVRT, RVRTConfig
 from quiver.model.rivals.spk2imgnet import Spk2ImgNet, Spk2ImgNetConfig
 from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
 from quiver.model.unet import UNet, UNetConfig
+from quiver.model.without_values import WithoutValues
 
 PRESETS: dict[str, Config] = {
     "quiver": Config(),
@@ -89,9 +91,10 @@ def ablated(config: Config, row: str) -> Config:
     return smaller
 
 
+@cache
 def parameter_count(config: Config) -> int:
     """Return the number of parameters, counted without memory for them."""
-    with torch.device("meta"):
+    with torch.device("meta"), WithoutValues():
         return sum(parameter.numel() for parameter in QUIVER(config).parameters())
 
 

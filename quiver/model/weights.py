@@ -15,11 +15,11 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_safetensors
 from torch import Tensor, nn
-from torch.overrides import TorchFunctionMode
 
 from qsim.files import write_bytes
 from qsim.thread_warnings import warnings_here
 from quiver.model.presets import NETWORKS
+from quiver.model.without_values import WithoutValues
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files
 MAX_CONFIG = 10_000  # characters of a configuration
@@ -83,7 +83,7 @@ def load(path: Path) -> nn.Module:
         if len(metadata["config"]) > MAX_CONFIG:
             raise ValueError(f"a configuration of {len(metadata['config'])} characters")
         values = json.loads(metadata["config"])
-        with torch.device("meta"), _WithoutValues():
+        with torch.device("meta"), WithoutValues():
             network = _build(metadata["network"], values)
         for name, value in network.state_dict().items():
             if name in tensors and tensors[name].dtype != value.dtype:
@@ -121,21 +121,6 @@ def annotate(path: Path, notes: Mapping[str, str | None]) -> None:
         raise ValueError(f"{path}: not weights of this program (no format {FORMAT!r}); see `quiver convert-weights`")
     kept = {name: text for name, text in (metadata | dict(notes)).items() if text is not None}
     write_bytes(path, to_safetensors(tensors, kept))
-
-
-class _WithoutValues(TorchFunctionMode):
-    """Makes layers without first values, which a file replaces: every function that sets values in place does nothing.
-
-    On "meta", the first of some of these functions imports for two seconds. `t_` acts, because it sets a
-    shape: `torch.nn.init.orthogonal_` needs it, which does nothing on "meta" in later versions of torch only.
-    """
-
-    def __torch_function__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        if func.__name__.endswith("_") and not func.__name__.endswith("__") and func.__name__ != "t_":
-            return args[0] if args else (kwargs or {})["tensor"]  # the latter for functions of torch.nn.init
-        return func(*args, **(kwargs or {}))
 
 
 def _build(kind: str, values: dict[str, object]) -> nn.Module:
