@@ -34,6 +34,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from machines import eps, walk
 from torch import Tensor, nn
@@ -210,6 +211,11 @@ def beyond(
 def golden_files(name: str) -> list[Path]:
     """The committed golden file of a network, and the full one where the specification is available."""
     return [DATA / f"golden_{name}.npz", *(path for path in [SHARED / f"golden_{name}.npz"] if path.is_file())]
+
+
+def slow_beyond_the_first(files: list[Path]) -> list[object]:
+    """Parameters of a test: `make test` compares the committed file alone."""
+    return [files[0], *(pytest.param(path, marks=pytest.mark.slow) for path in files[1:])]
 
 
 def arrays_of(path: Path) -> dict[str, np.ndarray]:

@@ -185,9 +185,16 @@ def _only_a_note() -> Iterator[None]:
         yield
 
 
-def prepared(row: Row, main: Main, work: Path, folder: Path, capsys: Any, monkeypatch: Any) -> Path:
-    """A copy of the work folder in which the row's command can run."""
-    shutil.copytree(work, folder, symlinks=True)
+def prepared(
+    row: Row, main: Main, work: Path, folder: Path, capsys: Any, monkeypatch: Any, option: str = "", named: bool = False
+) -> Path:
+    """A copy of the work folder in which the row's command can run; with `named`, of what the row names alone."""
+    words = f"{row.command} {option} {row.before}"
+
+    def left_out(place: str, entries: list[str]) -> list[str]:
+        return [name for name in entries if named and place == str(work) and name.partition(".")[0] not in words]
+
+    shutil.copytree(work, folder, symlinks=True, ignore=left_out)
     if callable(row.before):
         monkeypatch.chdir(folder)
         row.before(folder)
@@ -200,12 +207,12 @@ def prepared(row: Row, main: Main, work: Path, folder: Path, capsys: Any, monkey
 _WITHOUT: dict[tuple[Any, ...], Run] = {}
 
 
-def without(row: Acts, main: Main, work: Path, capsys: Any, monkeypatch: Any) -> Run:
+def without(row: Acts, main: Main, work: Path, capsys: Any, monkeypatch: Any, named: bool = False) -> Run:
     """The run without the option: once for all rows of one command, whose results are read from its folder."""
     key = (main, work, row.command, row.before, row.after)
     if key not in _WITHOUT:
         folder = Path(tempfile.mkdtemp(prefix="without", dir=work.parent)) / "work"
-        prepared(row, main, work, folder, capsys, monkeypatch)
+        prepared(row, main, work, folder, capsys, monkeypatch, named=named)
         _WITHOUT[key] = finished(row, row.command, main, folder, capsys, monkeypatch)
     return _WITHOUT[key]
 
@@ -229,18 +236,18 @@ def _check_refusal(row: Refused, run: Run) -> None:
     assert "Traceback" not in run.err, run.err
 
 
-def check(row: Row, main: Main, work: Path, tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
-    """Assert what a row says."""
+def check(row: Row, main: Main, work: Path, tmp_path: Path, capsys: Any, monkeypatch: Any, named: bool = False) -> None:
+    """Assert what a row says. With `named`, rows name all that their commands need of the work folder."""
     line = f"{row.command} {row.option}"
     if isinstance(row, Refused):
-        folder = prepared(row, main, work, tmp_path / "work", capsys, monkeypatch)
+        folder = prepared(row, main, work, tmp_path / "work", capsys, monkeypatch, row.option, named)
         before = _state(folder)
         _check_refusal(row, execute(main, line, folder, capsys, monkeypatch))
         assert _state(folder) == before, "something was changed or left behind"
         return
-    plain = without(row, main, work, capsys, monkeypatch)
+    plain = without(row, main, work, capsys, monkeypatch, named)
     assert plain.code in row.codes, plain.err
-    folder = prepared(row, main, work, tmp_path / "work", capsys, monkeypatch)
+    folder = prepared(row, main, work, tmp_path / "work", capsys, monkeypatch, row.option, named)
     changed = finished(row, line, main, folder, capsys, monkeypatch)
     assert row.result(plain) != row.result(changed), "the option changes nothing"
 

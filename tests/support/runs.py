@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from golden import SMALL
+from golden import TINY as NARROW
 from torch import nn
 
 from quiver.model.mergenet import MergeNet, MergeNetConfig
@@ -41,7 +41,7 @@ def same_weights(a: nn.Module, b: nn.Module) -> bool:
 
 TINY: dict[str, Callable[[], nn.Module]] = {  # a small network of every system that is trained on clips
     "unet": lambda: UNet(UNetConfig(4)),
-    "quiver": lambda: QUIVER(SMALL),
+    "quiver": lambda: QUIVER(NARROW),
     "emvd": lambda: EMVD(EMVDConfig(width=4)),
     "fastdvdnet": lambda: FastDVDnet(FastDVDnetConfig(width=4)),
     "student-teacher": lambda: StudentTeacher(StudentTeacherConfig(width=4, blocks=1)),

@@ -98,8 +98,14 @@ def test_frames_are_filled_alike_in_any_blocks():
     assert filled(codes, np.zeros((8, 10), bool)) is codes
 
 
-@pytest.mark.parametrize("frames", [1, 2, 11])
-@pytest.mark.parametrize("name", sorted(METHODS))
+@pytest.mark.parametrize(
+    ("name", "frames"),
+    [
+        pytest.param(name, frames, marks=[pytest.mark.slow] if name.startswith("qbp") and frames == 11 else [])
+        for name in sorted(METHODS)
+        for frames in (1, 2, 11)
+    ],
+)
 def test_no_method_sees_a_defective_pixel(name, frames):
     """Any codes below the map, one frame or several: the same video, without a NaN."""
     rng = np.random.default_rng(3)

@@ -107,14 +107,15 @@ def clamped_error(output: np.ndarray, target: np.ndarray, factor: float) -> floa
     return float(np.sum((np.clip(factor * output, 0, 1) - np.clip(target, 0, 1)) ** 2))
 
 
+@pytest.mark.parametrize("draws", [15, pytest.param(150, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("chunk", [5, 1 << 20])
-def test_the_factor_is_the_best_behind_the_clamp(chunk, monkeypatch):
+def test_the_factor_is_the_best_behind_the_clamp(chunk, draws, monkeypatch):
     """Against 4001 factors tried one by one, over random images; and the matched score is never below the raw one."""
     monkeypatch.setattr(metrics, "CHUNK", chunk)
     rng = np.random.default_rng(5)
     tried = np.geomspace(*metrics.FACTORS, 4001)
     moved = 0
-    for _ in range(150):
+    for _ in range(draws):
         output, target = drawn_pair(rng)
         least = min(clamped_error(output, target, s) for s in tried)
         found = metrics.best_scale(output, target)
@@ -123,7 +124,7 @@ def test_the_factor_is_the_best_behind_the_clamp(chunk, monkeypatch):
         for per_frame in (False, True):
             score = metrics.score(output, target, per_frame_scale=per_frame)
             assert score.psnr_matched >= score.psnr or math.isnan(score.psnr)
-    assert moved > 100  # the search is no search if 1 is always best
+    assert moved > draws * 2 / 3  # the search is no search if 1 is always best
 
 
 def test_no_score_is_infinite_unless_the_frames_are_equal():

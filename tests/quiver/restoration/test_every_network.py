@@ -93,7 +93,10 @@ def test_half_precision_stays_near(name):
     assert 0 < np.abs(low - full).max() < 0.2 * max(codes.white, np.abs(full).max())
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "quiver" else n for n in EVERY])
+SLOW = ("quiver", "spk2imgnet", "rvrt")  # more than two seconds
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in EVERY])
 def test_a_frame_beyond_the_memory_is_cut_exactly_or_with_a_word(name, monkeypatch):
     """Tiles change nothing, or a warning states by how much they differ and, where that is known, what avoids it."""
     monkeypatch.setattr("quiver.restoration.pieces.TILING", 0)  # a small frame would fit into it

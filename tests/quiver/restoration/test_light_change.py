@@ -39,12 +39,13 @@ def scene(rng: np.random.Generator, side: int, frames: int, speed: float) -> Arr
     return np.stack(out)
 
 
+@pytest.mark.parametrize("scenes", [10, pytest.param(40, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("light", LIGHTS)
-def test_motion_and_noise_are_no_change_of_light(light):
-    """Forty scenes; remarks begin at 8 %."""
+def test_motion_and_noise_are_no_change_of_light(light, scenes):
+    """Random scenes; remarks begin at 8 %."""
     rng = np.random.default_rng(5)
     found = []
-    for seed in range(40):
+    for seed in range(scenes):
         side, frames, speed = (
             int(rng.integers(48, 112)),
             int(rng.integers(2, 14)),

@@ -162,8 +162,9 @@ def test_damaged_notes_are_no_obstacle(tmp_path, blocks_of_four):
         assert "starting again" in said[0]
 
 
+@pytest.mark.parametrize("stride", [4, pytest.param(1, marks=pytest.mark.slow)])  # quickly before one event in four
 @pytest.mark.parametrize("replaces", [False, True])
-def test_killed_anywhere_it_ends_whole(tmp_path, blocks_of_four, replaces):
+def test_killed_anywhere_it_ends_whole(tmp_path, blocks_of_four, replaces, stride):
     """SIGKILL before each event of the file system in turn, with or without an earlier video of this name: the same
     call ends with the same bytes, nothing is left.
     """
@@ -174,7 +175,7 @@ def test_killed_anywhere_it_ends_whole(tmp_path, blocks_of_four, replaces):
         if replaces:
             restore_to_file(codes, restorer("naive"), path)
 
-    step = 1
+    step = 1 + replaces
     earlier()
     while killed_at(step, tmp_path, lambda: restore_to_file(codes, moment, path, force=replaces)):
         with contextlib.suppress(FileExistsError):  # killed after it had its name: it is there
@@ -186,7 +187,7 @@ def test_killed_anywhere_it_ends_whole(tmp_path, blocks_of_four, replaces):
             assert file.name in ("r.npy", "r.json", "r.npy.lock"), file
             file.unlink()
         earlier()
-        step += 1
+        step += stride
     assert step > 15
 
 

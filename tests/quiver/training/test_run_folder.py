@@ -8,8 +8,8 @@ import json
 import math
 import os
 import random
-import subprocess
-import sys
+import resource
+import signal
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 import torch
+from forks import forked
 from hostile import MEMORY, one_line, patience
 from runs import settings, small_network
 from safetensors import safe_open
@@ -30,8 +31,6 @@ from quiver.training.optimiser import Optimiser
 from quiver.training.run_folder import Run
 from quiver.training.schedule import State
 from quiver.training.settings import Settings, settled
-
-ROOT = Path(__file__).parents[3]
 
 
 def test_files_of_a_run(tiny_dataset, tmp_path):
@@ -85,18 +84,18 @@ def test_other_conditions_are_refused(tmp_path, name, began, now, says):
     again(now)
 
 
-def test_one_process_at_a_time_trains_in_a_folder(tiny_dataset, tmp_path):
+def test_one_process_at_a_time_trains_in_a_folder(tiny_dataset, tmp_path, capsys):
     """A second command is refused in one line, also with --force; the folder does not change."""
     mine, _ = settled(settings(tiny_dataset, tmp_path / "r"))
-    words = [sys.executable, "-m", "quiver", "train", tiny_dataset, "-o", mine.out, "--steps", 6, "--crop", 16]
-    words += ["--preset", "unet"]
+    words = ["train", str(tiny_dataset), "-o", mine.out, "--steps", "6", "--crop", "16", "--preset", "unet"]
     with Run(mine).open():
         before = {path.name: path.read_bytes() for path in Path(mine.out).iterdir()}
-        done = subprocess.run([str(w) for w in words], cwd=ROOT, capture_output=True, text=True, check=False)
-        assert (done.returncode, done.stdout) == (2, "")
-        assert f"{mine.out}: another process trains here; wait for it to end" in done.stderr
-        assert done.stderr.count("\n") == 1
-        assert main([str(w) for w in [*words[3:], "--force"]]) == 2
+        for more in ([], ["--force"]):
+            assert main([*words, *more]) == 2
+            shown = capsys.readouterr()
+            assert shown.out == ""
+            assert f"{mine.out}: another process trains here; wait for it to end" in shown.err
+            assert shown.err.count("\n") == 1
         assert {path.name: path.read_bytes() for path in Path(mine.out).iterdir()} == before
     opened(mine)
 
@@ -121,34 +120,25 @@ def test_a_full_disk_inside_a_checkpoint(tiny_dataset, tmp_path, monkeypatch):
     assert not list((tmp_path / "r").glob("*.tmp-*"))
 
 
-FILLED = """
-import resource, signal, sys
-from pathlib import Path
-from quiver.training.optimiser import Optimiser
-from quiver.training.run_folder import Run
-from quiver.training.schedule import State
-from quiver.training.settings import Settings
-from quiver.model.unet import UNet, UNetConfig
-
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-run, network = Run(Settings("d", sys.argv[1], steps=2)), UNet(UNetConfig(4))
-optimiser = Optimiser(network, "adam", 1e-3, (0.9, 0.99))
-run.save(run.checkpoint, network, optimiser, State())
-whole = run.checkpoint.read_bytes()
-for share in (0.9, 0.5, 0.1, 0.0):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * len(whole)), -1))
-    try:
-        run.save(run.checkpoint, network, optimiser, State(step=1))
-    except OSError as error:
-        print(error.filename, run.checkpoint.read_bytes() == whole, len(list(run.folder.iterdir())))
-"""
-
-
 def test_a_disk_that_is_full_after_some_bytes_of_a_checkpoint(tmp_path):
     """The write fails halfway, at the system's limit on file sizes; the old file stays."""
-    words = [sys.executable, "-c", FILLED, str(tmp_path)]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines() == 4 * [f"{tmp_path / 'checkpoint.pt'} True 1"]
+    run, network = Run(Settings("d", str(tmp_path), steps=2)), UNet(UNetConfig(4))
+    optimiser = Optimiser(network, "adam", 1e-3, (0.9, 0.99))
+    run.save(run.checkpoint, network, optimiser, State())
+    whole = run.checkpoint.read_bytes()
+
+    def filled() -> None:
+        """In a process of its own, whose limit cannot be raised again."""
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        for share in (0.9, 0.5, 0.1, 0.0):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * len(whole)), -1))
+            with pytest.raises(OSError) as error:
+                run.save(run.checkpoint, network, optimiser, State(step=1))
+            assert error.value.filename == str(run.checkpoint)
+            assert run.checkpoint.read_bytes() == whole
+            assert list(run.folder.iterdir()) == [run.checkpoint]
+
+    assert os.waitstatus_to_exitcode(os.waitpid(forked(filled), 0)[1]) == 0
 
 
 def test_a_damaged_state_is_named(tiny_dataset, tmp_path):
