@@ -154,14 +154,15 @@ def test_matched_means_share_no_frame_with_the_middle_and_are_cut_where_the_clip
     assert matched(8, range(-9, 12), block=7) == [(0, 5), (5, 8)]
 
 
-def test_shifts_near_the_ends_follow_the_motion():
+@pytest.mark.parametrize("windows", [6, pytest.param(24, marks=pytest.mark.slow)])
+def test_shifts_near_the_ends_follow_the_motion(windows):
     """Noiseless pictures at constant speed, random windows that reach beyond the clip or not: 0.15 px.
 
     Frames beyond the ends were reflections, and took the shift of the place that they filled. A single block has
     nothing to be matched with.
     """
     rng, picture = np.random.default_rng(6), texture((64, 128))
-    for _ in range(24):
+    for _ in range(windows):
         block = int(rng.choice([1, 1, 3]))
         window, length = block * int(rng.integers(2, 12)), int(rng.integers(2, 12))
         frame, speed = int(rng.integers(length)), rng.uniform(-2, 2, 2)
@@ -178,7 +179,7 @@ def test_shifts_near_the_ends_follow_the_motion():
         assert error < 0.15, (block, window, length, frame, speed, error)
 
 
-@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("backwards", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_first_and_last_frames_are_merged_along_their_motion(backwards):
     """Six frames instead of eleven raise the error of noise to 11 / 6; a wrong shift of reflected frames raised it
     to more than twice that of a frame in the middle.

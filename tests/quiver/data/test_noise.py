@@ -145,8 +145,9 @@ HOSTILE = (
 )
 
 
+@pytest.mark.parametrize("share", [4, pytest.param(1, marks=pytest.mark.slow)])  # quickly one value in four
 @pytest.mark.parametrize("name", ["noise", "sensor", "ppp", "bits", "steps", "seed", "data"])
-def test_any_value_in_the_settings_of_a_run(data, tmp_path, name):
+def test_any_value_in_the_settings_of_a_run(data, tmp_path, name, share):
     """Refused in one line, or a run as before; all settings, and every key of a noise."""
     run = small(data, tmp_path / "r")
     train(network(), run, progress=False)
@@ -156,7 +157,7 @@ def test_any_value_in_the_settings_of_a_run(data, tmp_path, name):
     values: list[object] = [*HOSTILE]
     if name == "noise":
         values += [[*HOSTILE], *([noise | {key: v}] for noise in good["noise"][:1] for key in noise for v in HOSTILE)]
-    for value in values:
+    for value in values[::share]:
         path.write_text(json.dumps(good | {name: value}))
         try:
             assert train(network(), run, progress=False).finished

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -129,7 +130,15 @@ def windows_with_seed(data: Windows, seed: int) -> Windows:
     return Windows(data.clips, replace(data.settings, seed=seed), repeats=2)
 
 
-@pytest.mark.parametrize("workers", [2, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_pickled_copy_draws_the_same_bytes(make_clip: ClipMaker):
+    """As every worker has one."""
+    data = three_clips(make_clip)
+    copy = pickle.loads(pickle.dumps(data))
+    assert all(same(data[n], copy[n]) for n in range(4))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [2, 1])
 def test_workers_draw_the_same_bytes(make_clip: ClipMaker, workers: int):
     data = three_clips(make_clip)
     alone = list(DataLoader(data, batch_sampler=Batches(2, 1, 4)))

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 import pytest
 import torch
-from golden import SMALL, draw, lively, network
+from golden import TINY, draw, lively, network
 from torch import Tensor
 
 from quiver.model import schedules
@@ -20,19 +20,20 @@ def run(schedule: Callable[[QUIVER, Iterable[Tensor]], Iterator[Tensor]], networ
 
 
 def test_exact_reuse_equals_windows_from_scratch():
-    network, x = lively(SMALL), draw(2, 15, 1, 16, 24)
+    network, x = lively(TINY), draw(2, 15, 1, 16, 24)
     windows = run(schedules.windows, network, x)
     assert windows.shape == (2, 5, 1, 16, 24)
     assert float((run(schedules.exact, network, x) - windows).abs().max()) < 1e-10 * float(windows.std())
 
 
 def test_streaming_equals_one_pass_over_the_clip():
-    network, x = lively(SMALL), draw(2, 15, 1, 16, 24)
+    network, x = lively(TINY), draw(2, 15, 1, 16, 24)
     with torch.no_grad():
         whole = network(x).scale1
     assert float((run(schedules.stream, network, x) - whole).abs().max()) < 1e-10 * float(whole.std())
 
 
+@pytest.mark.slow
 def test_the_published_network_runs_by_every_schedule():
     network, x = lively(Config(16)), draw(1, 13, 1, 8, 12)
     with torch.no_grad():
@@ -44,7 +45,7 @@ def test_the_published_network_runs_by_every_schedule():
 
 def test_streaming_is_not_the_same_as_windows():
     """The kept state and the missing zeros make a difference, which is not large."""
-    network, x = lively(SMALL), draw(1, 16, 1, 16, 24)
+    network, x = lively(TINY), draw(1, 16, 1, 16, 24)
     windows, stream = run(schedules.windows, network, x), run(schedules.stream, network, x)
     difference = (windows - stream).square().mean().sqrt() / windows.std()
     assert 1e-6 < float(difference) < 0.5
@@ -52,7 +53,7 @@ def test_streaming_is_not_the_same_as_windows():
 
 @pytest.mark.parametrize("schedule", [schedules.exact, schedules.stream])
 def test_frames_are_taken_one_by_one_and_denoised_once(schedule, monkeypatch):
-    network = lively(SMALL, torch.float32)
+    network = lively(TINY, torch.float32)
     taken, denoised = [], []
 
     def frames() -> Iterator[Tensor]:

@@ -16,7 +16,18 @@ import golden_flornn
 import numpy as np
 import pytest
 import torch
-from golden import DATA, arrays_of, beyond, compare, draw, errors, fill_by_rule, golden_files, weights_by_table
+from golden import (
+    DATA,
+    arrays_of,
+    beyond,
+    compare,
+    draw,
+    errors,
+    fill_by_rule,
+    golden_files,
+    slow_beyond_the_first,
+    weights_by_table,
+)
 from torch import Tensor
 
 from quiver.model.rivals import flornn
@@ -48,7 +59,7 @@ def stages(arrays: dict[str, np.ndarray], weights: dict[str, Tensor]) -> dict[st
         return {key: value.numpy() for key, value in golden_flornn.stages(arrays, weights).items()}
 
 
-@pytest.mark.parametrize("path", golden_files("flornn"), ids=str)
+@pytest.mark.parametrize("path", slow_beyond_the_first(golden_files("flornn")), ids=str)
 def test_every_stage_equals_the_published_one(path):
     found = errors("flornn", arrays_of(path), TABLE)
     assert len(found) >= 3
