@@ -58,7 +58,8 @@ def main(words: list[str] | None = None) -> int:
     parser = options(__doc__, "ablation_rows", ABLATIONS)
     parser.add_argument("--steps", type=count, help="steps of every row, all rows at once (default: 20 minutes each)")
     args = parser.parse_args(words)
-    budget, names = TINY if args.tiny else Budget(minutes=20.0), args.rows.split(",")
+    budget = TINY if args.tiny else Budget(minutes=20.0)
+    names = args.rows.split(",")
     if args.steps:
         budget = Steps(crop=budget.crop, steps=args.steps)
     unknown = sorted(set(names) - set(ABLATIONS))

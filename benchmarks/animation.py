@@ -21,7 +21,9 @@ import qsim
 import quiver
 from qsim import colour, files
 
-HEIGHT, WIDTH, FRAMES = 192, 288, 30
+HEIGHT = 192
+WIDTH = 288
+FRAMES = 30
 SHOWN = range(6, 24)  # frames of the film, whose windows of 11 frames lie in the clip
 PPP = 3.25
 CAPTION = 22  # pixels above every panel
@@ -68,7 +70,8 @@ def film(shown: list[Panel], columns: int = 3) -> bytes:
         sheet = Image.new("L", size, 24)
         draw = ImageDraw.Draw(sheet)
         for i, panel in enumerate(shown):
-            x, y = i % columns * (width + GAP), i // columns * (height + CAPTION)
+            x = i % columns * (width + GAP)
+            y = i // columns * (height + CAPTION)
             sheet.paste(Image.fromarray(colour.tone(panel.photons[t], white)), (x, y + CAPTION))
             draw.text((x + 4, y + 2), panel.caption, fill=255, font=font)
         frames.append(sheet.convert("RGB"))

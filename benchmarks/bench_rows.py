@@ -173,7 +173,9 @@ def cells(cost: dict[str, Any]) -> list[str]:
     """Return seconds, frames per second, memory, multiply-accumulates and PSNR of a line of `quiver bench`."""
     if cost["failure"] is not None:
         return [f"failed: {cost['failure']}", *[""] * 4]
-    taken, macs, psnr = cost["seconds_per_frame"], cost["gmac_per_frame"], cost["psnr_matched"]
+    taken = cost["seconds_per_frame"]
+    macs = cost["gmac_per_frame"]
+    psnr = cost["psnr_matched"]
     return [
         *(f"{taken:.3g}", f"{1 / taken:.3g}", f"{cost['peak_bytes'] / 1e6:.0f}"),
         *("" if macs is None else f"{float(f'{macs:.3g}'):g}", "" if psnr is None else f"{psnr:.2f}"),

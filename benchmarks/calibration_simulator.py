@@ -91,7 +91,9 @@ class SPADArray:
 
 def neighbours() -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
     """Return the four pairs (source, target) of slices of an image [H, W] that shift it by one pixel."""
-    first, last, whole = slice(None, -1), slice(1, None), slice(None)
+    first = slice(None, -1)
+    last = slice(1, None)
+    whole = slice(None)
     return [
         ((first, whole), (last, whole)),
         ((last, whole), (first, whole)),

@@ -78,7 +78,8 @@ def timed_frames(
     `processor_seconds` are those of the radiance, without ground truth and writing; `parts` are all by name. They are
     medians without the first frame, which compiles. `writer` holds as many frames as there are `numbers`.
     """
-    pictures, taken = {}, []
+    pictures = {}
+    taken = []
     with timed_parts(targets) as parts, writer:
         for place, t in enumerate(numbers):
             parts.turn()

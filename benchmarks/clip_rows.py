@@ -120,7 +120,8 @@ def moving_scene(family: str, plan: Plan) -> tuple[Scene, float]:
 
     `ValueError` if no speed is found.
     """
-    speed, found = 1.0, []
+    speed = 1.0
+    found = []
     for _ in range(TRIED):
         scene = scenes.load(family, seed=plan.scene_seed, speed=speed).resized(plan.height, plan.width)
         motion = median_motion(scene, plan)
@@ -186,7 +187,8 @@ def naive_loop(scene: Scene, plan: Plan, references: Array) -> dict[str, Any]:
     """Return what the naive loop costs that reaches the level in each unit, extrapolated from TRIAL samples."""
     loop = NaiveLoop(Renderer(scene, seed=plan.seed))
     loop.mean(plan.rendered[0], TRIAL)  # compiles
-    pictures, seconds = [], []
+    pictures = []
+    seconds = []
     for t in plan.judged:
         started = time.process_time()
         pictures.append(loop.mean(t, TRIAL))

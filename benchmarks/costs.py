@@ -26,7 +26,8 @@ BOUND = 20.0  # microseconds per pixel
 def qis(rng: np.random.Generator) -> Sensor:
     well = float(10 ** rng.uniform(-2, 4)) if rng.random() < 0.3 else None
     noise = float(rng.choice([0.0, rng.uniform(0, 10)]))
-    gain, offset = float(10 ** rng.uniform(-3, 3)), float(rng.uniform(-300, 300))
+    gain = float(10 ** rng.uniform(-3, 3))
+    offset = float(rng.uniform(-300, 300))
     return QIS(rng.uniform(0.05, 1), 10 ** rng.uniform(-1, 5), noise, int(rng.integers(1, 17)), gain, offset, well)
 
 
@@ -65,7 +66,8 @@ def cost(sensor: Sensor, photons: np.ndarray) -> float:
 def main(count: int) -> int:
     worst = 0.0
     for name, make in MODELS.items():
-        rng, found = np.random.default_rng(0), []
+        rng = np.random.default_rng(0)
+        found = []
         for _ in range(count):
             sensor = make(rng)
             white = min(sensor.white(EXPOSURE), 1e6)

@@ -175,7 +175,8 @@ def surroundings(light: dict[str, Any], found: dict[str, np.ndarray]) -> None:
 def configure(description: dict[str, Any], options: argparse.Namespace) -> None:
     """Set film, samples, depth and denoiser; nothing is clamped, filtered, cut or adapted."""
     scene = bpy.context.scene
-    render, cycles = scene.render, scene.cycles
+    render = scene.render
+    cycles = scene.cycles
     render.engine, cycles.device = "CYCLES", "CPU"
     render.threads_mode, render.threads = "FIXED", options.threads
     render.resolution_x, render.resolution_y = description["width"], description["height"]
@@ -198,7 +199,8 @@ def configure(description: dict[str, Any], options: argparse.Namespace) -> None:
 
 def rendered(moving: Moving, frame: int, folder: Path) -> tuple[np.ndarray, list[float]]:
     """Return the radiance [H, W] of a frame, and its wall and processor seconds."""
-    wall, processor = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    processor = time.process_time()
     for thing, matrices in moving:
         thing.matrix_world = Matrix(matrices[frame].tolist())
     bpy.ops.render.render()

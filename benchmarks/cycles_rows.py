@@ -126,7 +126,8 @@ class Ours:
         """Render the clip once."""
         pictures = []
         for t in range(self._plan.frames):
-            wall, used = time.perf_counter(), time.process_time()
+            wall = time.perf_counter()
+            used = time.process_time()
             picture = self.renderer.frame(t, with_truth=False).radiance
             if t in steady_frames(self._plan, self.budget.neighbours):
                 self.timed.seconds.append([time.perf_counter() - wall, time.process_time() - used])
@@ -172,7 +173,8 @@ def measure(family: str, plan: Plan, python: str) -> dict[str, Any]:
         deep = Renderer(scene, budget=Budget(plan.reference * 2, DEEPEST), seed=plan.seed + 1000)
         cycles_scene.write(scene, [deep.time(t) for t in range(plan.frames)], cycles.scene)
         halves = [deep.halves([deep.time(t)], deep.budget, deep.key(t)) for t in plan.judged]
-        own, other = np.stack(halves, axis=1), cycles.converged()
+        own = np.stack(halves, axis=1)
+        other = cycles.converged()
         white = white_in(own.mean(axis=0))
         agree = agreement(own, other, white)
         if agree["difference"] < AGREED:

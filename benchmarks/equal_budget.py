@@ -72,7 +72,8 @@ APART = "bit2bit"  # begins the names of networks that learn from the streams th
 
 def main(words: list[str] | None = None) -> int:
     args = parser().parse_args(words)
-    budget, names = TINY if args.tiny else Budget(), args.rows.split(",")
+    budget = TINY if args.tiny else Budget()
+    names = args.rows.split(",")
     unknown = sorted(set(names) - set(ROWS))
     if unknown:
         print(f"equal_budget: no row is called {unknown[0]!r}; known are {', '.join(ROWS)}", file=sys.stderr)
@@ -139,7 +140,8 @@ def learned(name: str, args: argparse.Namespace, budget: Budget) -> tuple[Path, 
     trials: dict[str, dict[str, Any]] = {}
     for rate in RATES.get(name.removesuffix("-1m"), RATES_OF_OTHERS):
         trials[rate] = trial(name, rate, args.work / f"{name}_trial_{rate}", args.data, budget)
-    rate, folder = best_rate(trials), args.work / name
+    rate = best_rate(trials)
+    folder = args.work / name
     train(name, rate, folder, args.data, budget)
     found = read_json(folder / "history.json")
     row = {"name": name, "kind": "network", "rate": float(rate), "trials": trials, "settings": found["settings"]}
@@ -189,7 +191,8 @@ def of_design(weights: Path) -> dict[str, Any]:
     from quiver.model.weights import load
     from quiver.restoration.restorers import restorer
 
-    found, method = load(weights), restorer(str(weights))
+    found = load(weights)
+    method = restorer(str(weights))
     restoring = found.student if isinstance(found, StudentTeacher) else found
     count = sum(parameter.numel() for parameter in restoring.parameters())
     frames = {"window": method.frames_used, "look_ahead": method.look_ahead}
@@ -214,7 +217,7 @@ def train(name: str, rate: str, folder: Path, data: Path, budget: Budget, *, sho
         *("--optimiser", "adam", "--learning-rate", rate, "--crop", crop, "--batch", budget.batch),
         *("--sensor", "quiver-physical", "--ppp", LIGHTS[0], "--bits", 3, "-q"),
         budget=budget,
-    )  # fmt: skip
+    )
 
 
 # ---- Tables
@@ -242,8 +245,10 @@ def write_tables(out: Path) -> None:
     if streams:
         text += [f"## Learned from the test streams themselves, {at}", "", STREAMS, ""]
         header = ("network", "MACs/px", "restoring", "parameters", "steps", "rate", *HEADER[8:])
-        cells = [[starred(row), *size_cells(row), *score_cells(row["scores"][at]), *cost_cells(row), speed(row)]
-                 for row in streams]  # fmt: skip
+        cells = [
+            [starred(row), *size_cells(row), *score_cells(row["scores"][at]), *cost_cells(row), speed(row)]
+            for row in streams
+        ]
         text += [*markdown_table(cells, header), ""]
     text += ["## The same weights at other light levels, matched PSNR [dB]", ""]
     text += [*markdown_table(light_cells(rows), ("method", *(f"{light} PPP" for light in LIGHTS))), ""]
@@ -259,12 +264,22 @@ RANKS = f"""Networks below {FLOOR} have no rank. Frames: those of which one is r
 Convolution: the reference convolution on the machine of a row, whose seconds compare with those of rows alike. Seconds
 of classical methods are those of the evaluation."""
 SCORED = f"A network above {FLOOR} on the validation clips is scored on test clips; a score below it there is left out."
-WIDTHS = ("network", "MACs/px", "parameters", "steps", "rate", "last validation [dB]", "PSNR matched",
-          "seconds/frame", "MB", "convolution [ms]")  # fmt: skip
+WIDTHS = (
+    "network",
+    "MACs/px",
+    "parameters",
+    "steps",
+    "rate",
+    "last validation [dB]",
+    "PSNR matched",
+    "seconds/frame",
+    "MB",
+    "convolution [ms]",
+)
 HEADER = (
     *("rank", "method", "frames", "MACs/px", "restoring", "parameters", "steps", "rate", "PSNR matched", "PSNR"),
     *("SSIM matched", *(f"{name} px" for name in bin_names()), "seconds/frame", "MB", "convolution [ms]"),
-)  # fmt: skip
+)
 
 
 def ranked(networks: list[dict[str, Any]], classical: dict[str, Any], floor: float, at: str) -> list[list[str]]:

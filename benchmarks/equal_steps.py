@@ -41,7 +41,8 @@ def main(words: list[str] | None = None) -> int:
     parser = options(__doc__, "equal_steps", NAMES)
     parser.add_argument("--steps", type=count, required=True, help="steps of every row")
     args = parser.parse_args(words)
-    names, crop = args.rows.split(","), TINY.crop if args.tiny else Steps.crop
+    names = args.rows.split(",")
+    crop = TINY.crop if args.tiny else Steps.crop
     budget = Steps(crop=crop, batch=TINY.batch if args.tiny else 4, steps=args.steps)
     unknown = sorted(set(names) - set(NAMES))
     if unknown:

@@ -169,13 +169,36 @@ def sensor(report: dict[str, Any]) -> str:
     ]
     cases = [[case["name"], case["found"], "right" if case["ok"] else "**wrong**"] for case in report["cases"]]
     count = f"{report['pixels']} pixels a draw. {verdict}"
-    return "\n".join([SENSOR, _table(header, rows), "", count, *outside, "", "### Hard cases", "",
-                      _table(["case", "found", ""], cases), ""])  # fmt: skip
+    return "\n".join(
+        [
+            SENSOR,
+            _table(header, rows),
+            "",
+            count,
+            *outside,
+            "",
+            "### Hard cases",
+            "",
+            _table(["case", "found", ""], cases),
+            "",
+        ]
+    )
 
 
 def rendering(report: dict[str, Any]) -> str:
-    header = ["scene", "asked [dB]", "reached [dB]", "stated [dB]", "samples", "denoised", "bounces", "s/frame",
-              "naive s/frame", "naive [dB]", "times faster"]  # fmt: skip
+    header = [
+        "scene",
+        "asked [dB]",
+        "reached [dB]",
+        "stated [dB]",
+        "samples",
+        "denoised",
+        "bounces",
+        "s/frame",
+        "naive s/frame",
+        "naive [dB]",
+        "times faster",
+    ]
     rows = [
         [
             row["scene"],
@@ -210,15 +233,27 @@ def rendering(report: dict[str, Any]) -> str:
 
 def _samples(row: dict[str, Any]) -> str:
     """Return the samples of a row, those chosen if they were raised, and the neighbours that share them."""
-    chosen, neighbours = row.get("chosen_samples"), row.get("neighbours")
+    chosen = row.get("chosen_samples")
+    neighbours = row.get("neighbours")
     raised = f", raised from {chosen}" if chosen and chosen < row["samples"] else ""
     return f"{row['samples']}{raised}" + (f", {neighbours} neighbours" if neighbours else "")
 
 
 def light(report: dict[str, Any]) -> str:
-    header = ["scene", "asked [dB]", "reached [dB]", "stated [dB]", "reached without clamp [dB]",
-              "stated without clamp [dB]", "samples", "denoised", "bounces",
-              "light [%]", "announced [%]", "± [%]"]  # fmt: skip
+    header = [
+        "scene",
+        "asked [dB]",
+        "reached [dB]",
+        "stated [dB]",
+        "reached without clamp [dB]",
+        "stated without clamp [dB]",
+        "samples",
+        "denoised",
+        "bounces",
+        "light [%]",
+        "announced [%]",
+        "± [%]",
+    ]
     rows = [
         [
             row["scene"],

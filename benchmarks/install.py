@@ -61,7 +61,8 @@ class Place:
         variables = {name: value for name, value in os.environ.items() if KEPT.fullmatch(name)}
         variables |= {"PATH": str(self.environment / "bin"), "HOME": str(self.folder / "home"), "LANG": "C.UTF-8"}
         uid = None if as_owner else self.uid
-        started, spent = time.perf_counter(), _processor_time()
+        started = time.perf_counter()
+        spent = _processor_time()
         ended = subprocess.run(
             [str(word) for word in words],
             cwd=self.folder / "work",

@@ -96,7 +96,8 @@ TINY = Size(windows=8, steps=6, batch=2, crop=32, test=1)
 
 def main(words: list[str] | None = None) -> int:
     args = options().parse_args(words)
-    size, names = TINY if args.tiny else Size(), args.rows.split(",")
+    size = TINY if args.tiny else Size()
+    names = args.rows.split(",")
     torch.set_num_threads(1)
     try:
         args.work = keep_apart("restorer_ablation", args.out, args.work, trial=args.tiny)
@@ -165,10 +166,16 @@ def draw(kind: str, split: str, args: argparse.Namespace, size: Size, folder: Pa
     clips = [clip for data in folders for clip in open_clips(data, split)]
     if not clips:
         raise ValueError(f"{folders[0]}: no finished clip in split '{split}'; finish `qsim generate`")
-    lights = TEST_LIGHTS if split == "test" else tuple(
-        Illumination(sensor, ppp, bits)
-        for sensor in PROTOCOL["sensor"] for bits in PROTOCOL["bits"] for ppp in PROTOCOL["ppp"]
-    )  # fmt: skip
+    lights = (
+        TEST_LIGHTS
+        if split == "test"
+        else tuple(
+            Illumination(sensor, ppp, bits)
+            for sensor in PROTOCOL["sensor"]
+            for bits in PROTOCOL["bits"]
+            for ppp in PROTOCOL["ppp"]
+        )
+    )
     if kind == "one":
         lights = (Illumination("quiver-physical", 3.25, 3),)
     settings = WindowSettings(crop=size.crop, lights=lights, seed=1 if split == "test" else 0, flips=False)
@@ -219,7 +226,8 @@ def learned(variant: Variant, seed: int, args: argparse.Namespace, size: Size) -
     torch.manual_seed(seed)
     network = MergeNet(MergeNetConfig(width=variant.width))
     optimiser = Optimiser(network, variant.kind, variant.rate, (0.9, 0.99))
-    batches, curve = order(size, seed), []
+    batches = order(size, seed)
+    curve = []
     for step in range(size.steps):
         batch = turned(pick(halves, next(batches)), (seed, step))
         error_of(network, batch, variant).mean().backward()
@@ -228,7 +236,8 @@ def learned(variant: Variant, seed: int, args: argparse.Namespace, size: Size) -
         network.zero_grad()
         if (step + 1) % -(-size.steps // REPORT) == 0 or step + 1 == size.steps:
             curve.append({"step": step + 1, "psnr": float(np.mean(scores(network, test, variant)))})
-    psnr, ppp = scores(network, test, variant), np.asarray(test["ppp"])
+    psnr = scores(network, test, variant)
+    ppp = np.asarray(test["ppp"])
     levels = {f"{low:g} to {high:g}": float(psnr[(ppp >= low) & (ppp < high)].mean()) for low, high in LEVELS}
     return {"text": variant.text, "seed": seed, "psnr": float(psnr.mean()), "by_light": levels, "curve": curve}
 
@@ -310,9 +319,12 @@ def write_table(out: Path) -> None:
     levels = [f"{key} PPP" for key in rows[0]["by_light"]]
     text = ["# What each idea of mergenet brings", ""]
     text += ["Made by `python benchmarks/restorer_ablation.py out/photos out/restorer out/restorer_test`.", ""]
-    text += [f"{size['steps']} steps of {size['batch']} windows of {size['crop']} x {size['crop']} px from "
-             f"{size['windows']} windows. Mean PSNR in dB on windows of the test clips, peak 2.5 times the mean light, "
-             "1, 3 and 7 bits at 0.5, 3.25 and 26 photons per pixel.", ""]  # fmt: skip
+    text += [
+        f"{size['steps']} steps of {size['batch']} windows of {size['crop']} x {size['crop']} px from "
+        f"{size['windows']} windows. Mean PSNR in dB on windows of the test clips, peak 2.5 times the mean light, "
+        "1, 3 and 7 bits at 0.5, 3.25 and 26 photons per pixel.",
+        "",
+    ]
     head = ("trained", "seeds", "difference from all", *levels)
     text += [*markdown_table(table, head), "", LIMITS, ""]
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())

@@ -134,9 +134,12 @@ def page(found: Array, scenes: int, size: int, weights: str) -> str:
     best = np.take(BITS, found.argmax(-1))
     three = BITS.index(3)
     text = ["# The best bit depth with the default restorer", "", "Made by `python benchmarks/restorer_bits.py`.", ""]
-    text += [f"Mean over {scenes} scenes of {size} x {size} px in which photographs slide before one another; "
-             f"weights {weights[:12]}. PSNR is matched, peak 2.5 times the mean light. Light is counted in photons per "
-             "pixel and plane of 0.1 ms, alike for all depths, motion in px per 3-bit code.", ""]  # fmt: skip
+    text += [
+        f"Mean over {scenes} scenes of {size} x {size} px in which photographs slide before one another; "
+        f"weights {weights[:12]}. PSNR is matched, peak 2.5 times the mean light. Light is counted in photons per "
+        "pixel and plane of 0.1 ms, alike for all depths, motion in px per 3-bit code.",
+        "",
+    ]
     header = ("px per 3-bit code", *(f"{p:g} PPP per plane" for p in LIGHTS))
     rows = [
         (f"{m:g}", *(f"{best[i, j]} ({found[i, j].max() - found[i, j, three]:.1f})" for j in range(len(LIGHTS))))

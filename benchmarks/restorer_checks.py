@@ -58,7 +58,8 @@ def moved(codes: Codes, first: int) -> Codes:
 def shift(clip: Clip, light: Illumination, method: Restorer) -> dict[str, float]:
     """Return the rms difference of a shift by one pixel along both sides and the rms error, both over the peak."""
     codes, factor = sensed(clip, light, 0)
-    peak, t = peak_of(mean_light(clip, factor)), len(clip) // 2
+    peak = peak_of(mean_light(clip, factor))
+    t = len(clip) // 2
     here, there = (method.restore(moved(codes, first), t, t + 1)[0].clip(0, peak) / peak for first in (0, 1))
     target = truth(clip, factor, t, t + 1)[0].clip(0, peak)[:-1, :-1] / peak
     inner = (slice(EDGE, -EDGE), slice(EDGE, -EDGE))
@@ -85,7 +86,9 @@ def shifts(clips: Sequence[Clip], names: Sequence[str]) -> dict[str, dict[str, d
 
 def brightness(counts: Counts, names: Sequence[str], bits: int) -> dict[str, list[float]]:
     """Return the mean of each method's frame over that of the truth, both clamped at the peak, by split."""
-    rng, peak, methods = np.random.default_rng(0), peak_of(counts.light), restorers(names)
+    rng = np.random.default_rng(0)
+    peak = peak_of(counts.light)
+    methods = restorers(names)
     found: dict[str, list[float]] = {method.name: [] for method in methods}
     for _ in range(SPLITS):
         given = np.sort(rng.choice(len(counts.frames), WINDOW, replace=False))
@@ -106,7 +109,8 @@ def crops(clip: Clip, own: str) -> Image.Image:
     rows = []
     for ppp in SHOWN:
         codes, factor = sensed(clip, Illumination("quiver-physical", ppp, 3), 0)
-        peak, t = peak_of(mean_light(clip, factor)), len(clip) // 2
+        peak = peak_of(mean_light(clip, factor))
+        t = len(clip) // 2
         shown = {f"{ppp:g} PPP: one frame": codes.read(t, t + 1)[0] / (codes.sensor.levels - 1.0)}
         for name in (RIVAL, own):
             shown[name] = restorer(name).restore(codes, t, t + 1)[0] / peak
@@ -135,17 +139,23 @@ def page(found: dict[str, Any]) -> str:
         "",
     ]
     text += [f"Weights {found['weights'][:12]}.", "", "## A shift by one pixel", ""]
-    text += ["The rms difference between a shifted result and the result of shifted codes, over the rms error that is "
-             f"left; mean and largest over {found['clips']} clips, frame in the middle.", ""]  # fmt: skip
+    text += [
+        "The rms difference between a shifted result and the result of shifted codes, over the rms error that is "
+        f"left; mean and largest over {found['clips']} clips, frame in the middle.",
+        "",
+    ]
     rows = []
     for name, clips in found["shift"].items():
         shares = [one["difference"] / one["error"] for one in clips.values()]
         rows.append((name, f"{np.mean(shares):.3f}", f"{max(shares):.3f}"))
     text += [*markdown_table(rows, ("method, light", "mean", "largest")), "", "## Real photons", ""]
     photons = found["photons"]
-    text += [f"`{photons['counts']}`, a static object: eleven frames at {photons['bits']} bits, the truth is the mean "
-             f"of the others. Mean of three random splits; the variance of the truth is taken off. "
-             "Brightness: the mean over that of the truth, mean and standard error over six splits.", ""]  # fmt: skip
+    text += [
+        f"`{photons['counts']}`, a static object: eleven frames at {photons['bits']} bits, the truth is the mean "
+        f"of the others. Mean of three random splits; the variance of the truth is taken off. "
+        "Brightness: the mean over that of the truth, mean and standard error over six splits.",
+        "",
+    ]
     told = []
     for one in photons["scores"]:
         light = np.array(photons["brightness"][one["method"]])
@@ -192,7 +202,8 @@ def main(words: list[str] | None = None) -> int:
             },
             "shown": args.shown,
         }
-        text, picture = page(found), crops(shown[0], args.restorer)
+        text = page(found)
+        picture = crops(shown[0], args.restorer)
         args.out.parent.mkdir(parents=True, exist_ok=True)
         picture.save(args.out.with_suffix(".jpg"), quality=QUALITY)
         write_json(args.out.with_suffix(".json"), found)

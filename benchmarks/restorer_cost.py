@@ -176,7 +176,8 @@ def command_memory(size: tuple[int, int]) -> int:
     photons = np.stack([np.roll(picture, 2 * t, axis=1) for t in range(FRAMES)]) * (3.25 / picture.mean())
     sensor = quiver_physical(3.25)
     with tempfile.TemporaryDirectory() as folder:
-        codes, out = Path(folder) / "codes.npy", Path(folder) / "restored.npy"
+        codes = Path(folder) / "codes.npy"
+        out = Path(folder) / "restored.npy"
         np.save(codes, sensor.sample(photons, 5e-4, key=Key(0, 0)))
         words = ["restore", codes, "--ppp", "3.25", "--method", "mergenet", "-q", "-o", out]
         program = [sys.executable, "-c", COMMAND, *map(str, words)]
@@ -201,8 +202,11 @@ def page(found: dict[str, list[tuple[float, float]]], memory: int, size: str, bu
     text = ["# What the restorer costs", "", "Made by `python benchmarks/restorer_cost.py`.", ""]
     text += [f"Seconds per frame of {size}, eleven frames at 3 bits and 3.25 PPP, both programs in turn.", ""]
     text += [*markdown_table(table, ("program", "median [s]", "runs [s]", "most memory of the process")), ""]
-    text += [f"`quiver restore` of these frames takes {memory / 1e6:.0f} MB, its complete process counted. The "
-             "programs of the table also hold and draw the light.", ""]  # fmt: skip
+    text += [
+        f"`quiver restore` of these frames takes {memory / 1e6:.0f} MB, its complete process counted. The "
+        "programs of the table also hold and draw the light.",
+        "",
+    ]
     text += [f"Ratio of the medians: {old / own:.2f}. Machine: {rows.machine()}.", ""]
     return "\n".join([*text, *(["Measured beside other programs.", ""] if busy else [])])
 

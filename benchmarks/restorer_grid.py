@@ -178,22 +178,34 @@ def write_tables(out: Path, names: Sequence[str], clips: Sequence[str]) -> None:
         "Made by `python benchmarks/restorer_grid.py out/restorer_test` on the clips of `scenes/restorer_test.toml`.",
         "",
     ]
-    text += [f"Matched PSNR in dB, peak 2.5 times the mean light, mean over {len(clips)} clips, "
-             f"{cells[0]['frames']} frames of each. Weights: {cells[0]['weights'][:12]}.", ""]  # fmt: skip
-    text += [f"Mean over {len(rows)} cells: {np.mean(gains):+.2f} dB. Least: {min(gains):+.2f} dB. Below the best "
-             f"classical method: {', '.join(lost) or 'no cell'}.", ""]  # fmt: skip
+    text += [
+        f"Matched PSNR in dB, peak 2.5 times the mean light, mean over {len(clips)} clips, "
+        f"{cells[0]['frames']} frames of each. Weights: {cells[0]['weights'][:12]}.",
+        "",
+    ]
+    text += [
+        f"Mean over {len(rows)} cells: {np.mean(gains):+.2f} dB. Least: {min(gains):+.2f} dB. Below the best "
+        f"classical method: {', '.join(lost) or 'no cell'}.",
+        "",
+    ]
     apart = np.array([gain for cell in cells for gain in by_clip(cell)])
-    text += [f"By single clips: in {np.sum(apart < 0)} of {len(apart)} pairs of cell and clip the best of all "
-             f"classical methods is better, by {max(0, -apart.min()):.2f} dB at most. Giving exactly these pairs "
-             f"to that method would gain {np.mean(np.maximum(-apart, 0)):.2f} dB in the mean.", ""]  # fmt: skip
+    text += [
+        f"By single clips: in {np.sum(apart < 0)} of {len(apart)} pairs of cell and clip the best of all "
+        f"classical methods is better, by {max(0, -apart.min()):.2f} dB at most. Giving exactly these pairs "
+        f"to that method would gain {np.mean(np.maximum(-apart, 0)):.2f} dB in the mean.",
+        "",
+    ]
     table = [
         (name, f"{own:.2f}", f"{best} {rival:.2f}", f"{own - rival:+.2f}", *(f"{x:+.2f}" for x in bins))
         for name, own, best, rival, bins in rows
     ]
     bins = tuple(f"{name} px" for name in bin_names())
     text += [*markdown_table(table, ("cell", "restorer", "best classical", "difference", *bins)), ""]
-    text += ["Columns of motion [px/frame]: difference from the classical method that is best in the bin. "
-             "Cells: sensor, bits or planes, photons per pixel and code.", ""]  # fmt: skip
+    text += [
+        "Columns of motion [px/frame]: difference from the classical method that is best in the bin. "
+        "Cells: sensor, bits or planes, photons per pixel and code.",
+        "",
+    ]
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())
     draw(dict(zip((row[0] for row in rows), gains, strict=True)), out.with_suffix(".png"))
 

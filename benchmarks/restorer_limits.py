@@ -32,9 +32,11 @@ from quiver.restoration.domain_remarks import light_change
 from quiver.restoration.restorers import restorer, weights_path
 
 ROOT = Path(__file__).parents[1]
-NAME, RIVAL = "mergenet", "qbp-bm3d"
+NAME = "mergenet"
+RIVAL = "qbp-bm3d"
 EXPOSURE = 5e-4  # s
-FRAMES, MIDDLE = 11, 5
+FRAMES = 11
+MIDDLE = 5
 BITS = (1, 2, 3, 7)
 LEVELS = (0.5, 3.25, 26.0, 100.0)  # PPP that the gain is set for
 SHARES = (0.1, 1.0, 2.0)  # light of a flat field over that level
@@ -130,12 +132,15 @@ def fields(draws: int, size: int) -> dict[str, list[list[float]]]:
     """Return brightness by depth and gain, of flat fields at SHARES of the level that the gain is set for."""
     return {
         f"{bits} bit, gain of {level:g} PPP": [
-            [brightness(NAME, flat(Illumination(ppp=level, bits=bits), level * k, size, n), level * k)
-             for n in range(draws)]
+            [
+                brightness(NAME, flat(Illumination(ppp=level, bits=bits), level * k, size, n), level * k)
+                for n in range(draws)
+            ]
             for k in SHARES
         ]
-        for bits in BITS for level in LEVELS
-    }  # fmt: skip
+        for bits in BITS
+        for level in LEVELS
+    }
 
 
 def planes(draws: int, size: int) -> dict[str, list[float]]:
@@ -226,8 +231,9 @@ def details(draws: int, size: int) -> dict[str, dict[str, list[float]]]:
     """Return PSNR [dB] by method of fine patterns, and of points on a dark ground."""
     cases = {
         f"{name}, {ppp:g} PPP": [(ppp * frames, ppp)] * draws
-        for ppp in LIGHTS for name, frames in patterns(size).items()
-    }  # fmt: skip
+        for ppp in LIGHTS
+        for name, frames in patterns(size).items()
+    }
     for ground, more in POINTS:
         for speed in SPEEDS:
             rare = [np.random.default_rng(n).random((size, size)) < RARE for n in range(draws)]
@@ -251,9 +257,12 @@ def told(values: Sequence[float], digits: int) -> str:
 def page(found: dict[str, Any]) -> str:
     """Return the page of what was measured."""
     text = ["# The restorer outside of its grid", "", "Made by `python benchmarks/restorer_limits.py`.", ""]
-    text += [f"Weights {found['weights'][:12]}, {found['draws']} draws of {found['size']} x {found['size']} px and "
-             f"{FRAMES} frames; mean and standard error. The frame in the middle is scored, {EDGE} px from its edges. "
-             "Sensor `quiver-physical` where none is named.", ""]  # fmt: skip
+    text += [
+        f"Weights {found['weights'][:12]}, {found['draws']} draws of {found['size']} x {found['size']} px and "
+        f"{FRAMES} frames; mean and standard error. The frame in the middle is scored, {EDGE} px from its edges. "
+        "Sensor `quiver-physical` where none is named.",
+        "",
+    ]
     text += ["## Flat fields", "", "Brightness: the mean over that of the truth.", ""]
     header = ("depth, gain", *(f"field of {k:g} of that light" for k in SHARES))
     text += markdown_table([(name, *(told(v, 3) for v in row)) for name, row in found["fields"].items()], header)
@@ -261,14 +270,18 @@ def page(found: dict[str, Any]) -> str:
     text += markdown_table([(k, told(v, 3)) for k, v in found["planes"].items()], ("field", "brightness"))
     text += ["", "## Dark counts", "", "A flat field seen by `quiver-published` at 3 bits.", ""]
     text += markdown_table([(k, told(v, 3)) for k, v in found["dark"].items()], ("method, light", "brightness"))
-    text += ["", "## Few frames", "",
-             f"The gain is over {RIVAL}, at 3.25 PPP, 3 bits, 2 px/frame.", ""]  # fmt: skip
+    text += ["", "## Few frames", "", f"The gain is over {RIVAL}, at 3.25 PPP, 3 bits, 2 px/frame.", ""]
     rows = [(k, *(told(x, 3) for x in v["brightness"]), told(v["gain"], 2)) for k, v in found["short"].items()]
     header = ("frames", *(f"brightness, {sensor}, {bits} bit, {ppp:g} PPP" for sensor, ppp, bits in SEEN), "gain [dB]")
     text += markdown_table(rows, header)
-    text += ["", "## Hot and dead pixels", "",
-             f"{100 * DEFECTIVE:g} % of the pixels, half of them without codes, half with the top code, "
-             "3 bits: dB that they cost.", ""]  # fmt: skip
+    text += [
+        "",
+        "## Hot and dead pixels",
+        "",
+        f"{100 * DEFECTIVE:g} % of the pixels, half of them without codes, half with the top code, "
+        "3 bits: dB that they cost.",
+        "",
+    ]
     rows = [(k, told(v["map"], 2), told(v["no map"], 2)) for k, v in found["defects"].items()]
     text += markdown_table(rows, ("light, motion", "with the map [dB]", "without it [dB]"))
     text += [
@@ -279,15 +292,23 @@ def page(found: dict[str, Any]) -> str:
         "",
     ]
     text += markdown_table([(k, told(v, 2)) for k, v in found["faults"].items()], ("fault, light", "cost [dB]"))
-    text += ["", "## Light that changes", "",
-             f"3 bits; the light rises steadily over {FRAMES} frames. The gain is over {RIVAL}. The change that is "
-             "found in the codes alone leaves out what noise may explain (quiver/restoration/domain_remarks.py).",
-             ""]  # fmt: skip
+    text += [
+        "",
+        "## Light that changes",
+        "",
+        f"3 bits; the light rises steadily over {FRAMES} frames. The gain is over {RIVAL}. The change that is "
+        "found in the codes alone leaves out what noise may explain (quiver/restoration/domain_remarks.py).",
+        "",
+    ]
     rows = [(k, told(v["gain"], 2), f"{100 * np.mean(v['found']):.0f} %") for k, v in found["changing"].items()]
     text += markdown_table(rows, ("light, motion, change", "gain [dB]", "change found"))
-    text += ["", "## Fine patterns and points", "",
-             f"3 bits; patterns of contrast {CONTRAST:g}, points in {100 * RARE:g} % of the pixels. PSNR in dB.",
-             ""]  # fmt: skip
+    text += [
+        "",
+        "## Fine patterns and points",
+        "",
+        f"3 bits; patterns of contrast {CONTRAST:g}, points in {100 * RARE:g} % of the pixels. PSNR in dB.",
+        "",
+    ]
     methods = (NAME, *CLASSICAL)
     rows = [(k, *(told(v[method], 1) for method in methods)) for k, v in found["details"].items()]
     text += markdown_table(rows, ("picture", *methods))

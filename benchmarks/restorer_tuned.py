@@ -52,7 +52,8 @@ TINY = Size(steps=2, validate_every=1, crop=32, batch=2, frames=1)
 
 def main(words: list[str] | None = None) -> int:
     args = options().parse_args(words)
-    size, known = TINY if args.tiny else Size(), {place.name: place for place in places()}
+    size = TINY if args.tiny else Size()
+    known = {place.name: place for place in places()}
     try:
         args.work = keep_apart("restorer_tuned", args.out, args.work, trial=args.tiny)
         for name in args.cells.split(","):
@@ -135,8 +136,11 @@ def write_table(out: Path) -> None:
         "Made by `python benchmarks/restorer_tuned.py out/photos out/restorer out/restorer_val out/restorer_test`.",
         "",
     ]
-    text += [f"{size['steps']} steps from the shipped weights with windows of one cell alone. Mean matched PSNR in dB "
-             f"over {len(rows[0]['clips'])} test clips, {size['frames']} frames of each.", ""]  # fmt: skip
+    text += [
+        f"{size['steps']} steps from the shipped weights with windows of one cell alone. Mean matched PSNR in dB "
+        f"over {len(rows[0]['clips'])} test clips, {size['frames']} frames of each.",
+        "",
+    ]
     text += [*markdown_table(table, ("cell", "shipped", "tuned", "difference", "of single clips")), ""]
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())
 

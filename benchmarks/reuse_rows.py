@@ -45,7 +45,9 @@ ROOT = Path(__file__).parents[1]
 FAMILIES = ("fence", "glass", "glossy", "lamp", "pellets", "plain", "room", "shadow", "wires")  # none tuned a constant
 SEED = 61  # its clips of lamp, glossy, room and fence chose how a shared frame states its error
 MARK = " \\*"
-WITHIN, NEVER = 1.0, 2.0  # dB between stated and reached, in nine of ten frames; by which no frame states too little
+# dB between stated and reached, in nine of ten frames; by which no frame states too little
+WITHIN = 1.0
+NEVER = 2.0
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,8 @@ class Clip:
 
     def row(self, plan: Plan, references: dict[int, Array], white: float) -> dict[str, Any]:
         """Return what was measured, by the references [2, H, W] of the judged frames."""
-        budget, apart = self.renderer.budget, {}
+        budget = self.renderer.budget
+        apart = {}
         for t in plan.judged:
             apart[t] = np.minimum(self.images[t], white) - np.minimum(references[t], white)
         reached = {t: decibels(white, float(np.mean(d[0] * d[1]))) for t, d in apart.items()}
@@ -171,7 +174,8 @@ def measure(family: str, plan: Plan) -> dict[str, Any]:
 def table(rows: dict[str, dict[str, Any]]) -> str:
     """Return the page of the rows, by name."""
     header = ("scene", "alone", "s", "shared", "s", "ratio", "reached", "stated - reached", "at most", "flicker")
-    lines, ratios = [], []
+    lines = []
+    ratios = []
     stating: dict[str, list[float]] = {}
     for name, row in rows.items():
         ratio = row["alone"]["processor_seconds"] / row["shared"]["processor_seconds"]

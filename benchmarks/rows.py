@@ -91,7 +91,8 @@ def everybodys_seconds() -> float | None:
 
 def wait_for_quiet() -> None:
     """Wait until other programs use at most QUIET cores; `ValueError` if they still use more after PATIENCE."""
-    started, told = time.monotonic(), False
+    started = time.monotonic()
+    told = False
     while True:
         watch = Watch.now()
         time.sleep(WATCH)
@@ -167,7 +168,8 @@ def reference_convolution(threads: int) -> float:
     """Return the milliseconds of a 3 x 3 convolution of 64 channels at 128 x 128 px: the least of twenty."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
-    layer, image = torch.nn.Conv2d(64, 64, 3, padding=1), torch.zeros(1, 64, 128, 128)
+    layer = torch.nn.Conv2d(64, 64, 3, padding=1)
+    image = torch.zeros(1, 64, 128, 128)
     taken = []
     with torch.inference_mode():
         for _ in range(REFERENCE_RUNS):
@@ -201,7 +203,8 @@ def make_row(
     earlier = read_json(sessions)["cores_of_others"] if sessions.exists() else []
     sessions.parent.mkdir(parents=True, exist_ok=True)
     write_json(sessions, {"cores_of_others": [*earlier, None]})  # until this session ends
-    watch, before = Watch.now(), reference_convolution(budget.threads)
+    watch = Watch.now()
+    before = reference_convolution(budget.threads)
     try:
         own = make()
     finally:

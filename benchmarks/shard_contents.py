@@ -25,7 +25,8 @@ FITTED = (1 / 64, 1 / 4)  # cycles/px between which the power law is fitted
 def contents(clip: Clip) -> dict[str, Any]:
     """Return the size, the budget and the stated PSNR of a clip, and its motion, contrast and spectrum."""
     clip.require_one_band("this page")
-    reached, budget = stated(clip.meta), clip.meta.get("render", {})
+    reached = stated(clip.meta)
+    budget = clip.meta.get("render", {})
     looked_at = np.unique(np.linspace(0, len(clip) - 1, LOOKED_AT).round().astype(int))
     images = np.stack([clip.radiance(int(t)) for t in looked_at])
     power = spectrum(images)
@@ -43,12 +44,15 @@ def contents(clip: Clip) -> dict[str, Any]:
 
 def motion(flows: Iterable[Array]) -> dict[str, Any]:
     """Return how many pixels of flows [2, H, W] are known, and how many of them move by EDGES px/frame."""
-    known, counts, summed = 0, np.zeros(len(EDGES) - 1, np.int64), 0.0
+    known = 0
+    counts = np.zeros(len(EDGES) - 1, np.int64)
+    summed = 0.0
     for flow in flows:
         length = np.hypot(*flow.astype(np.float64))
         length = length[np.isfinite(length)]
         moving = length[length >= MOVING]
-        known, summed = known + length.size, summed + float(moving.sum())
+        known = known + length.size
+        summed = summed + float(moving.sum())
         counts += np.histogram(moving, EDGES)[0]
     return {"known": known, "counts": counts.tolist(), "summed": summed}
 

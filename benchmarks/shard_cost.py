@@ -103,7 +103,8 @@ def read_shard(path: Path, wanted: dict[str, Recipe], what: str) -> dict[str, An
     way = next((way for way, each in wanted.items() if all(digests.get(j.name) == j.digest for j in each.jobs)), None)
     if way is None:
         raise ValueError(f"{path}: was made from another recipe than {what}")
-    names, done = sorted(job.name for job in wanted[way].jobs), set(data.names())
+    names = sorted(job.name for job in wanted[way].jobs)
+    done = set(data.names())
     if missing := [name for name in names if name not in done]:
         left = f"{len(missing)} of {len(names)} clips are not made yet, the first is {missing[0]}"
         raise ValueError(f"{path}: {left}; run `qsim generate` again")
@@ -132,7 +133,8 @@ def gather(args: argparse.Namespace) -> dict[str, Any]:
     wanted = recipe.load(args.recipe)
     ways = variants(wanted)
     parts = {way: part(each, args.shard) for way, each in ways.items()}
-    name, written = f"{args.recipe}", "{}/{}".format(*args.shard)
+    name = f"{args.recipe}"
+    written = "{}/{}".format(*args.shard)
     kinds = kind_of(ways["alone"]), kind_of(parts["alone"])
     if not kinds[1]:
         raise ValueError(
@@ -152,7 +154,8 @@ def gather(args: argparse.Namespace) -> dict[str, Any]:
         plans["shard"] = read_plan(args.shard_plan, parts, f"shard {written} of {name}")
     made = old.get("made") if args.data is None else read_shard(args.data, parts, name)
     if made is not None and "shard" in plans and plans["shard"]["way"] != made["way"]:
-        plan, clips = WAYS[plans["shard"]["way"]], WAYS[made["way"]]
+        plan = WAYS[plans["shard"]["way"]]
+        clips = WAYS[made["way"]]
         raise ValueError(f"the shard was planned for {plan}, and made with {clips}; plan the recipe that made it")
     found = {**same, "qsim": VERSION, "clips": len(wanted.jobs), "plans": plans}
     found["shard"] = {clip: {"whole": kinds[0][clip], "shard": kinds[1][clip]} for clip in sorted(kinds[1])}

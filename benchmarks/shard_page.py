@@ -56,7 +56,8 @@ def page(found: dict[str, Any], figure: str) -> str:
 
 def targets(found: dict[str, Any]) -> list[tuple[str, ...]]:
     """Return the cells of each target."""
-    plans, made = found["plans"], found.get("made")
+    plans = found["plans"]
+    made = found.get("made")
     share = memory = used = None
     if {"alone", "reuse"} <= plans.keys():
         share = plans["reuse"]["processor_hours"] / plans["alone"]["processor_hours"]
@@ -118,7 +119,8 @@ def span(values: Sequence[int]) -> str:
 
 def costs(found: dict[str, Any]) -> list[str]:
     """Return the table of planned and used cost of the shard's clips, with what is known of it."""
-    plans, made = found["plans"], found.get("made")
+    plans = found["plans"]
+    made = found.get("made")
     way = made["way"] if made is not None else plans.get("shard", {}).get("way", "reuse")
     columns: dict[str, list[dict[str, Any]]] = {}
     if way in plans:
@@ -170,7 +172,8 @@ def light(clips: dict[str, Any], figure: str) -> list[str]:
     spans = (f"{MOVING:g} to {low:g}", f"{low:g} to {high:g}", f"over {high:g}")
     lines = []
     for name, each in motions.items():
-        moving, shares = sum(each["counts"]), [f"{100 * share:.1f} %" for share in below_within_above(each["counts"])]
+        moving = sum(each["counts"])
+        shares = [f"{100 * share:.1f} %" for share in below_within_above(each["counts"])]
         mean = f"{each['summed'] / moving:.2f}" if moving else "–"
         lines.append((name, f"{100 * moving / max(each['known'], 1):.1f} %", mean, *shares))
     slower, within, faster = (100 * share for share in below_within_above(together["counts"]))
@@ -215,7 +218,8 @@ def draw(clips: dict[str, Any], path: Path) -> None:
     figure = new_figure(9.0, 3.6)
     left, right = figure.subplots(1, 2)
     edges = np.array(EDGES[:-1])
-    middle, fastest = np.sqrt(RINGS[1:] * RINGS[:-1]), MOTION[1]
+    middle = np.sqrt(RINGS[1:] * RINGS[:-1])
+    fastest = MOTION[1]
     for name, clip in clips.items():
         counts = np.array(clip["motion"]["counts"][:-1], float)
         fastest = max([fastest, *edges[1:][counts > 0]])

@@ -51,8 +51,13 @@ def refuse_busy(args: argparse.Namespace) -> None:
         raise ValueError("--busy: rows of equal steps are made on any cores and never marked; leave it out")
 
 
-def together(program: str, makers: Mapping[str, Callable[[], dict[str, Any]]], args: argparse.Namespace,
-             budget: Steps, page: Callable[[], None]) -> int:  # fmt: skip
+def together(
+    program: str,
+    makers: Mapping[str, Callable[[], dict[str, Any]]],
+    args: argparse.Namespace,
+    budget: Steps,
+    page: Callable[[], None],
+) -> int:
     """Make the rows that are missing, each by its maker, then `page`; return 1 if one failed, 0 otherwise.
 
     `FileNotFoundError` if a row is missing and the data set too. The others are made if one fails.

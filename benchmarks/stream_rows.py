@@ -39,7 +39,8 @@ def stream_network(
 
     `ValueError` for a data set without validation or test clips.
     """
-    clips, first = clips_of(args.data, "test"), clips_of(args.data, "val")[0]
+    clips = clips_of(args.data, "test")
+    first = clips_of(args.data, "val")[0]
     trials = {rate: {"psnr": trial(name, rate, first, args, budget)} for rate in rates}
     rate = best_rate(trials)
     minutes = budget.minutes / len(clips)
@@ -82,7 +83,8 @@ def trial(name: str, rate: str, clip: Clip, args: argparse.Namespace, budget: Bu
 
 def learned(name: str, rate: str, minutes: float, clip: Clip, args: argparse.Namespace, budget: Budget) -> Path:
     """Train on the stream of one clip, unless it is done, and return the folder of the run."""
-    copy, folder = args.work / f"{name}_clips" / clip.name, args.work / f"{name}_{clip.name}_{rate}"
+    copy = args.work / f"{name}_clips" / clip.name
+    folder = args.work / f"{name}_{clip.name}_{rate}"
     shutil.copytree(clip.path, copy, dirs_exist_ok=True)
     sense(Clip.open(copy), LIGHT.sensing(0))
     frames = min(FRAMES, len(clip) // 8 * 8)

@@ -112,7 +112,8 @@ def limit_threads() -> None:
 def report() -> dict[str, Any]:
     """Return what `qsim doctor` prints about rendering: the choice, every probe, versions, cache file."""
     engine = choose()
-    cuda, stored = probe_cuda(), _cached_probes()
+    cuda = probe_cuda()
+    stored = _cached_probes()
     probes = [asdict(probe) for probe in (stored if cuda in stored else [cuda, *stored])]  # one that passes is not kept
     software = {"mitsuba": version("mitsuba"), "drjit": version("drjit")}
     return asdict(engine) | {"probes": probes, "software": software, "cache": str(_cache_file() or "none (no home)")}

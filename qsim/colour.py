@@ -98,9 +98,11 @@ def flow_colours(flow: NDArray[np.floating], largest: float) -> NDArray[np.uint8
     """
     if not largest > 0:
         raise ValueError(f"flow_colours: the largest flow must be positive, got {largest!r} px")
-    u, v = flow[..., 0, :, :], flow[..., 1, :, :]
+    u = flow[..., 0, :, :]
+    v = flow[..., 1, :, :]
     unknown = ~(np.isfinite(u) & np.isfinite(v))
-    u, v = np.where(unknown, 0.0, u), np.where(unknown, 0.0, v)
+    u = np.where(unknown, 0.0, u)
+    v = np.where(unknown, 0.0, v)
     speed = np.minimum(np.hypot(u, v) / largest, 1.0)
     rgb = hue_from_turns(np.arctan2(v, u) / (2 * np.pi))
     rgb = 1.0 - speed[..., None] * (1.0 - rgb)
@@ -122,7 +124,8 @@ def error_colours(error: NDArray[np.floating], full: float) -> NDArray[np.uint8]
     if not full > 0:
         raise ValueError(f"error_colours: the error of the full colour must be positive, got {full!r}")
     share = np.clip(np.nan_to_num(error) / full, -1.0, 1.0)
-    above, below = np.maximum(share, 0.0), np.maximum(-share, 0.0)
+    above = np.maximum(share, 0.0)
+    below = np.maximum(-share, 0.0)
     rgb = 1.0 - np.stack([below, np.abs(share), above], axis=-1) * np.array([0.85, 0.8, 0.85])
     rgb[np.isnan(error)] = 0.5
     return np.rint(255.0 * rgb).astype(np.uint8)
@@ -161,7 +164,8 @@ def depth_colours(depth: NDArray[np.floating], near: float, far: float) -> NDArr
         raise ValueError(f"depth_colours: expected 0 < near <= far in metres, got {near!r} and {far!r}")
     hit = np.isfinite(depth) & (depth > 0)
     nearness = 1.0 / np.where(hit, depth, far)
-    low, high = 1.0 / far, 1.0 / near
+    low = 1.0 / far
+    high = 1.0 / near
     share = np.clip((nearness - low) / (high - low) if high > low else np.ones_like(nearness), 0.0, 1.0)
     rgb = np.stack([np.interp(share, _DEPTH_RAMP[:, 0], _DEPTH_RAMP[:, i]) for i in (1, 2, 3)], axis=-1)
     rgb[~hit] = 0

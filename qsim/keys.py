@@ -25,7 +25,8 @@ MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
 KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 COUNTED = 1 << 32  # frames (or planes), rows and columns that have a counter of 32 bits
 _BATCH = 1 << 13  # blocks that stay in the cache
-_LOW, _SHIFT = np.uint64(0xFFFFFFFF), np.uint64(32)
+_LOW = np.uint64(0xFFFFFFFF)
+_SHIFT = np.uint64(32)
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,10 @@ def philox4x32(counters: Array, key: int) -> Array:
     """Return four random words per counter: integers [4, ...] below 2^32 -> uint32 [4, ...] under a 64-bit key."""
     state = np.array(counters, np.uint64)
     c0, c1, c2, c3 = (state[i, ...] for i in range(4))
-    even, odd = np.empty_like(c0), np.empty_like(c2)
-    k0, k1 = key >> 32 & 0xFFFFFFFF, key & 0xFFFFFFFF
+    even = np.empty_like(c0)
+    odd = np.empty_like(c2)
+    k0 = key >> 32 & 0xFFFFFFFF
+    k1 = key & 0xFFFFFFFF
     for _ in range(ROUNDS):  # in place: this is the inner loop of the reference engine
         np.multiply(np.uint64(MULTIPLIERS[0]), c0, out=even)
         np.multiply(np.uint64(MULTIPLIERS[1]), c2, out=odd)
@@ -77,7 +80,8 @@ def philox4x32(counters: Array, key: int) -> Array:
             np.bitwise_xor(c, np.uint64(k), out=c)
         np.bitwise_and(odd, _LOW, out=c1)
         np.bitwise_and(even, _LOW, out=c3)
-        k0, k1 = (k0 + KEY_STEPS[0]) & 0xFFFFFFFF, (k1 + KEY_STEPS[1]) & 0xFFFFFFFF
+        k0 = (k0 + KEY_STEPS[0]) & 0xFFFFFFFF
+        k1 = (k1 + KEY_STEPS[1]) & 0xFFFFFFFF
     return state.astype(np.uint32)
 
 
@@ -91,7 +95,8 @@ def require_counters(key: Key, shape: tuple[int, ...], origin: tuple[int, int] =
         y, x = (index(place) for place in origin)
     except (TypeError, ValueError):
         raise ValueError(f"origin is a row and a column of the full frame, got {origin!r}") from None
-    first, count = key.frame * planes, planes * (frames[0] if frames else 1)
+    first = key.frame * planes
+    count = planes * (frames[0] if frames else 1)
     _require_counted("frames" if planes == 1 else f"planes ({planes} per frame)", first, count)
     _require_counted("rows", y, height)
     _require_counted("columns", x, width)
@@ -110,7 +115,8 @@ def words(key: Key, shape: tuple[int, ...], origin: tuple[int, int] = (0, 0), re
     require_counters(key, shape, origin)
     *frames, height, width = shape
     y, x = origin
-    first, last = x >> 2, (x + width + 3) >> 2
+    first = x >> 2
+    last = (x + width + 3) >> 2
     blocks = (frames[0] if frames else 1, height, last - first)
     result = np.empty((prod(blocks), 4), np.uint32)
     for start in range(0, len(result), _BATCH):

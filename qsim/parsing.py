@@ -44,11 +44,13 @@ def parse_json(path: Path, text: str) -> dict[str, Any]:
         value = json.loads(text, parse_constant=_no_constant)
         problem = _too_much(value, text)
     except RecursionError:
-        problem, value = (_line_of_depth(text), _TOO_DEEP), None
+        problem = (_line_of_depth(text), _TOO_DEEP)
+        value = None
     except (json.JSONDecodeError, _NotFinite) as error:
         raise ValueError(f"{path}: not readable as JSON ({error}); the file is damaged, make it again") from None
     except ValueError:  # of `int` for thousands of digits
-        problem, value = (_line_of_number(text), _TOO_LARGE), None
+        problem = (_line_of_number(text), _TOO_LARGE)
+        value = None
     if problem:
         raise ValueError(
             f"{path}: not readable as JSON ({problem[1]} in line {problem[0]}); the file is damaged, make it again"

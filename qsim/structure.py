@@ -20,7 +20,9 @@ from qsim import checks
 from qsim.checks import SPLITS, shown, suggest
 from qsim.files import NAME
 
-SMALLEST, LARGEST = 1e-30, 1e30  # of numbers above 0 in SI units: products of larger ones overflow
+# of numbers above 0 in SI units: products of larger ones overflow
+SMALLEST = 1e-30
+LARGEST = 1e30
 
 Check = Callable[[Any], Any]
 Table = Mapping[str, "Check | Table"]
@@ -36,7 +38,8 @@ def structure(
     `of` names the table in messages and `cure` says what to do. A closed table refuses keys that it does not list.
     """
     place = where if callable(where) else lambda _: where
-    title, advice = of and f" in {of}", cure and f"; {cure}"
+    title = of and f" in {of}"
+    advice = cure and f"; {cure}"
     if not isinstance(found, Mapping):
         raise ValueError(
             f"{place(None)}: {inside and f'{inside[:-1]}: '}expected a table of values, got {shown(found)}{advice}"
@@ -94,7 +97,8 @@ def _check_of(hint: Any) -> Check | Table:
     if is_dataclass(hint):
         return table_of(hint)
     if get_origin(hint) is tuple:
-        item, several = _CHECKS[get_args(hint)[0]], expected("a list", lambda value: isinstance(value, list | tuple))
+        item = _CHECKS[get_args(hint)[0]]
+        several = expected("a list", lambda value: isinstance(value, list | tuple))
         return lambda value: tuple(item(one) for one in several(value))
     return _CHECKS[hint]
 

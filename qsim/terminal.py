@@ -99,7 +99,8 @@ def is_lost(stream: object) -> bool:
 def tolerant_output() -> Iterator[tuple[Tolerant, Tolerant]]:
     """Let the block print to standard output and standard error, which it receives, without a failure."""
     open_descriptors()
-    out, err = Tolerant(sys.stdout), Tolerant(sys.stderr)
+    out = Tolerant(sys.stdout)
+    err = Tolerant(sys.stderr)
     with contextlib.redirect_stdout(cast(TextIO, out)), contextlib.redirect_stderr(cast(TextIO, err)):
         yield out, err
         out.flush()

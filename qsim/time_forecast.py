@@ -38,7 +38,8 @@ class TimeForecast:
         if self._first is None:
             self._first = (done, now)
             return
-        steps, since = done - self._first[0], now - self._first[1]
+        steps = done - self._first[0]
+        since = now - self._first[1]
         if self._say is None or steps < 1 or since < ENOUGH:
             return
         step = since / steps

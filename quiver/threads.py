@@ -97,7 +97,8 @@ def measured() -> Threads:
     most = min(torch.get_num_threads(), cores())
     if most == 1:
         return Threads(1, "torch was given no more")
-    x, kernel = torch.ones(1, 32, 64, 64), torch.ones(32, 32, 3, 3)
+    x = torch.ones(1, 32, 64, 64)
+    kernel = torch.ones(32, 32, 3, 3)
 
     def seconds(number: int) -> float:
         torch.set_num_threads(number)

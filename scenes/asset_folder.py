@@ -69,7 +69,8 @@ def _mesh(rng: np.random.Generator, meshes: list[Path]) -> tuple[Mesh, Material 
 
 def _flight(rng: np.random.Generator, speed: float) -> Translation:
     """Return the motion of a camera that flies by and passes its place in the middle of a clip."""
-    angle, rate = any_angle(rng), between(rng, 1.0, 3.0) * speed
+    angle = any_angle(rng)
+    rate = between(rng, 1.0, 3.0) * speed
     velocity = rate * np.array([np.cos(angle), 0.4 * np.sin(angle), 0.3 * rng.normal()])
     return Translation(vector(velocity), vector(-velocity * common.CLIP / 2))
 

@@ -29,7 +29,9 @@ from qsim.scene.bands import RGB, Colour, has_colour, three
 
 SUN = (1.12, 1.04, 0.84)  # of its mean over the bands, as all tints: a sun some way above the horizon
 SKY = (0.72, 0.96, 1.32)
-WARM, COOL = (1.38, 1.02, 0.60), (0.88, 1.0, 1.12)  # lamps between incandescent and daylight
+# lamps between incandescent and daylight
+WARM = (1.38, 1.02, 0.60)
+COOL = (0.88, 1.0, 1.12)
 BRIGHTEST = 0.95  # of any reflectance
 
 
@@ -56,7 +58,8 @@ def _painted(material: Material, rng: np.random.Generator) -> Material:
         parts: Any = tuple(_painted(part, rng) for part in material.materials)
         return replace(material, materials=parts)
     found: Any = material
-    dark, bright = _tint(rng), _tint(rng)
+    dark = _tint(rng)
+    bright = _tint(rng)
     names = {field.name for field in dataclasses.fields(found)}
     if has_colour(found) or not names & {"reflectance", "radiance"}:
         return material

@@ -26,7 +26,9 @@ from qsim.scene import (
 from qsim.scene.rotation import UP, exponential, pose_matrix, unit, vector
 from qsim.scene.shapes import moved, sheet
 
-HEIGHT, WIDTH = 512, 1024  # pixels; other sizes by Scene.resized, which keeps the height of the view
+# pixels; other sizes by Scene.resized, which keeps the height of the view
+HEIGHT = 512
+WIDTH = 1024
 FRAME_RATE = 2000.0  # Hz, the rate at which speed = 1 is defined
 PITCH = 1.1e-6  # m
 PHOTOGRAPHS = ("cat", "coffee", "astronaut", "rocket", "coins", "moon", "camera")
@@ -163,7 +165,8 @@ def lamp(rng: np.random.Generator, target: ArrayLike, distance: float = 2.5, pow
 
 def studio(rng: np.random.Generator, strength: float = 0.6, boxes: int = 5) -> EnvironmentImage:
     """Return a studio: soft boxes, grey walls, a dark floor; mean radiance `strength` [W m^-2 sr^-1]."""
-    height, width = 64, 128
+    height = 64
+    width = 128
     up = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi  # elevation [rad]
     azimuth = ((np.arange(width)[None, :] + 0.5) / width - 0.5) * 2 * np.pi
     room = 0.25 + 0.15 * np.sin(up) + 0.05 * np.cos(azimuth) + 0.1 * (up > 0.9)

@@ -42,12 +42,14 @@ def picture(family: str, seed: int, height: int, samples: int) -> tuple[NDArray[
 def sheet(rows: dict[str, list[NDArray[np.uint8]]], columns: int) -> Image.Image:
     """Return the page: families in `columns` columns, each with its name over the pictures of its seeds."""
     height, width = next(iter(rows.values()))[0].shape
-    line, gap = 14, 3
+    line = 14
+    gap = 3
     cell = (height + line + gap, len(next(iter(rows.values()))) * (width + gap))
     page = Image.new("L", (columns * cell[1] - gap, math.ceil(len(rows) / columns) * cell[0] - gap), 255)
     draw = ImageDraw.Draw(page)
     for i, (family, pictures) in enumerate(rows.items()):
-        top, left = i // columns * cell[0], i % columns * cell[1]
+        top = i // columns * cell[0]
+        left = i % columns * cell[1]
         draw.text((left + 2, top + 1), family, fill=0)
         for k, grey in enumerate(pictures):
             page.paste(Image.fromarray(grey), (left + k * (width + gap), top + line))
@@ -68,7 +70,8 @@ def main() -> None:
     for family in args.families:
         found = [picture(family, seed, args.height, args.samples) for seed in range(args.seeds)]
         means = " ".join(f"{mean:5.2f}" for _, mean, _, _ in found)
-        largest, share = max(f[2] for f in found), float(np.mean([f[3] for f in found]))
+        largest = max(f[2] for f in found)
+        share = float(np.mean([f[3] for f in found]))
         print(f"{family:10}  {means:36}  {largest:7.1f}  {share:13.3f}", flush=True)
         rows[family] = [grey for grey, *_ in found]
     args.output.parent.mkdir(parents=True, exist_ok=True)

@@ -23,7 +23,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     rates = rng.uniform(2.2, 3.8, 3)
     for i in range(int(rng.integers(60, 91))):
         stream = int(rng.integers(3))
-        angle, rate = headings[stream] + rng.normal(0, 0.15), speed * rates[stream] * rng.uniform(0.7, 1.2)
+        angle = headings[stream] + rng.normal(0, 0.15)
+        rate = speed * rates[stream] * rng.uniform(0.7, 1.2)
         velocity = rate * np.array([np.cos(angle), 0.0, np.sin(angle)])
         solid = shape(rng, between(rng, 0.012, 0.024))
         ground = -float(solid.vertices[:, 1].min()) + 0.008

@@ -44,7 +44,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 def pattern(rng: np.random.Generator) -> Picture:
     """Return stripes, checks or dots without random detail."""
-    low, high = between(rng, 0.03, 0.2), between(rng, 0.55, 0.85)
+    low = between(rng, 0.03, 0.2)
+    high = between(rng, 0.55, 0.85)
     kind = int(rng.integers(4))
     if kind == 0:
         return textures.stripes(int(rng.integers(8, 20)), low, high, duty=between(rng, 0.3, 0.7))

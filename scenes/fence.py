@@ -38,7 +38,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 def fence(rng: np.random.Generator) -> Mesh:
     """Return slats with gaps, tilted by a random angle, with two rails."""
-    pitch, share = between(rng, 0.05, 0.1), between(rng, 0.25, 0.42)
+    pitch = between(rng, 0.05, 0.1)
+    share = between(rng, 0.25, 0.42)
     lean = float(rng.choice([0.0, 0.0, 0.3, -0.5]))
     slats = [
         moved(box(pitch * share, 0.7, 0.008, 0.7), pose_matrix(exponential((0, 0, lean)), (x, 0, 0.05)))

@@ -36,7 +36,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 def train(rng: np.random.Generator, count: int) -> list[tuple[int, float, float, float]]:
     """Return (teeth, x, y, phase) of gears that mesh in sequence along a crooked line through the view."""
     teeth = [int(n) for n in rng.integers(9, 21, count)]
-    places, phases = [np.zeros(2)], [0.0]
+    places = [np.zeros(2)]
+    phases = [0.0]
     heading = between(rng, -0.6, 0.6)
     for i in range(1, count):
         reach = MODULE * (teeth[i - 1] + teeth[i])

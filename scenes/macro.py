@@ -16,7 +16,9 @@ from qsim.scenes import common
 from qsim.scenes.common import any_angle, between, sign
 
 PITCH = 6e-6  # m
-KEYS, STEP = 12, 0.04  # poses of the path, s between two at speed 1; it is walked back and forth
+# poses of the path, s between two at speed 1; it is walked back and forth
+KEYS = 12
+STEP = 0.04
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
@@ -104,5 +106,6 @@ class BackAndForth(Motion):
 
     def _within(self, t: float) -> float:
         """Return a time [s] of the path with the pose of time t."""
-        first, last = self.path.times[1], self.path.times[-2]
+        first = self.path.times[1]
+        last = self.path.times[-2]
         return t if t <= last else first + (t - last) % (last - first)

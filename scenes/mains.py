@@ -26,7 +26,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 def on_mains(rng: np.random.Generator) -> Flicker:
     """Return the flicker of a lamp at 50 or 60 Hz, smoothed or not."""
-    frequency, phase = 2 * pick(rng, (50.0, 60.0)), any_angle(rng)
+    frequency = 2 * pick(rng, (50.0, 60.0))
+    phase = any_angle(rng)
     depth = between(rng, 0.2, 0.8)
     return Mains(frequency, depth, phase) if rng.random() < 0.5 else RectifiedSine(frequency, phase)
 

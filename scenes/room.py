@@ -10,7 +10,10 @@ from qsim.scene.shapes import ball, box, cylinder, moved, sheet
 from qsim.scenes import common
 from qsim.scenes.common import any_angle, between, pick, sign
 
-WIDTH, HEIGHT, DEPTH = 4.0, 2.6, 5.0  # m
+# m
+WIDTH = 4.0
+HEIGHT = 2.6
+DEPTH = 5.0
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:

@@ -47,7 +47,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         (float(rng.normal(0, 0.15)), float(rng.normal(0, 0.25)), float(rng.normal(0, 0.08))),
     )
     motion: Motion = carrier(rng, speed) @ place
-    width, height = 0.40, 0.2
+    width = 0.40
+    height = 0.2
     dark = rng.random() < 0.5
     print_ = textures.lines_of_text(random_lines(rng), 1024, 512, *((0.8, 0.04) if dark else (0.06, 0.8)))
     back = moved(box(width, height, 0.006, 0.1), pose_matrix(None, (0, 0, -0.004)))
@@ -67,7 +68,8 @@ def carrier(rng: np.random.Generator, speed: float) -> Motion:
     """Return the motion of the plate: a slide, a swing or a shake."""
     kind = int(rng.integers(3))
     if kind == 0:
-        angle, rate = any_angle(rng), between(rng, 1.2, 2.5) * speed
+        angle = any_angle(rng)
+        rate = between(rng, 1.2, 2.5) * speed
         velocity = np.array([rate * np.cos(angle), 0.6 * rate * np.sin(angle), 0.3 * rng.normal() * speed])
         return Translation(vector(velocity), vector(-velocity * common.CLIP / 2))
     if kind == 1:

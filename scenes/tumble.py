@@ -41,7 +41,8 @@ def spread(rng: np.random.Generator, count: int) -> np.ndarray:
 
 def shape(rng: np.random.Generator) -> Mesh:
     """Return one solid, about 5 cm across."""
-    kind, size = int(rng.integers(7)), between(rng, 0.022, 0.036)
+    kind = int(rng.integers(7))
+    size = between(rng, 0.022, 0.036)
     if kind == 0:
         width, height, depth = size * rng.uniform(0.9, 1.9, 3)
         return box(width, height, depth, 2 * size)

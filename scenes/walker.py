@@ -28,9 +28,14 @@ from qsim.scenes import common
 from qsim.scenes.common import any_angle, between, pick
 
 Array = NDArray[np.float64]
-TRUNK, LEG, THICK = (0.075, 0.032, 0.036), 0.1, 0.013  # m: half axes, length and radius of a leg
+# m: half axes, length and radius of a leg
+TRUNK = (0.075, 0.032, 0.036)
+LEG = 0.1
+THICK = 0.013
 FLOOR = -LEG - 0.5 * TRUNK[1]  # m; the trunk is at 0
-TAIL, TAIL_JOINTS = 0.13, 5  # m
+# m
+TAIL = 0.13
+TAIL_JOINTS = 5
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
@@ -40,7 +45,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         common.floor(Diffuse(common.backdrop(rng)), 2.4, y=FLOOR, z=-0.2),
         common.wall(Diffuse(common.backdrop(rng)), 2.4, 1.2, z=-0.6, y=0.35),
     ]
-    yaw, rate = between(rng, -0.5, 0.5) + pick(rng, (0.0, np.pi)), between(rng, 1.2, 2.0) * speed
+    yaw = between(rng, -0.5, 0.5) + pick(rng, (0.0, np.pi))
+    rate = between(rng, 1.2, 2.0) * speed
     velocity = rate * exponential(common.upright(yaw))[:, 0]
     way = Translation(tuple(velocity), tuple(-velocity * common.CLIP / 2))
     mesh, motion = jointed(rng, speed, way @ Still((0.0, 0.0, 0.0), common.upright(yaw)))
@@ -71,20 +77,24 @@ class _Parts:
 
 def jointed(rng: np.random.Generator, speed: float, carrier: Motion) -> tuple[Mesh, Skinned]:
     """Return the mesh of a walker that looks along +x, and its motion; every random number is drawn at any speed."""
-    frequency, phase, pairs = between(rng, 9, 13), any_angle(rng), int(rng.integers(2, 4))
+    frequency = between(rng, 9, 13)
+    phase = any_angle(rng)
+    pairs = int(rng.integers(2, 4))
     parts = _Parts()
     trunk = parts.joint(Oscillation((0.0, 0.004, 0.0), 2 * frequency, phase))
     parts.add(moved(ball(1.0, 40), pose_matrix(np.diag(TRUNK))), np.full(3, trunk), np.array([1.0, 0, 0]))
     head = parts.joint(Pendulum((0.06, 0.01, 0.0), (0, 0, 1), between(rng, 0.1, 0.3), frequency, phase), trunk)
     skull = moved(ball(0.025, 32), pose_matrix(np.diag([1.3, 1, 1]), (0.084, 0.022, 0)))
     parts.add(skull, np.full(3, head), np.array([1.0, 0, 0]))
-    swing, bend = between(rng, 0.45, 0.7), between(rng, 0.3, 0.6)
+    swing = between(rng, 0.45, 0.7)
+    bend = between(rng, 0.3, 0.6)
     for i, x in enumerate(np.linspace(0.045, -0.045, pairs)):
         for k, z in enumerate((-0.026, 0.026)):
             _leg(parts, trunk, (float(x), -0.012, z), frequency, phase + np.pi * (i + k), swing, bend)
     _tail(parts, trunk, frequency / 2, any_angle(rng), between(rng, 0.15, 0.3))
     mesh = merged(parts.meshes)
-    owners, shares = np.concatenate(parts.owners), np.concatenate(parts.shares)
+    owners = np.concatenate(parts.owners)
+    shares = np.concatenate(parts.shares)
     clock = Clock(speed)
     return mesh, Skinned(mesh.vertices, tuple(parts.joints), owners, shares, clock=clock, carrier=carrier)
 
@@ -106,14 +116,16 @@ def _leg(
     outline = THICK * (0.6 + 0.4 * (1 + y)) * np.sqrt(np.clip(1 - (2 * y + 1) ** 12, 0, 1))
     mesh = moved(revolved(list(zip(outline.tolist(), (LEG * y).tolist(), strict=True)), 20), pose_matrix(None, hip))
     down = (hip[1] - mesh.vertices[:, 1]) / LEG  # 0 at the hip, 1 at the foot
-    at_hip, at_knee = 1 - _smooth(down / 0.15), _smooth((down - 0.4) / 0.2)
+    at_hip = 1 - _smooth(down / 0.15)
+    at_knee = _smooth((down - 0.4) / 0.2)
     shares = np.stack([at_hip, (1 - at_hip) * (1 - at_knee), (1 - at_hip) * at_knee], 1)
     parts.add(mesh, np.array([trunk, upper, lower]), shares)
 
 
 def _tail(parts: _Parts, trunk: int, frequency: float, phase: float, swing: float) -> None:
     """Add a tail along -x: a chain of joints that swing sideways one after the other."""
-    start, chain = -0.8 * TRUNK[0], [trunk]
+    start = -0.8 * TRUNK[0]
+    chain = [trunk]
     for i in range(TAIL_JOINTS):
         place = (start - TAIL * i / TAIL_JOINTS, 0.0, 0.0)
         chain.append(parts.joint(Pendulum(place, (0, 1, 0), swing, frequency, phase - 0.7 * i), chain[-1]))

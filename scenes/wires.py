@@ -37,7 +37,8 @@ def wheel(rng: np.random.Generator, radius: float) -> Mesh:
     """Return a rim with crossed spokes to a hub, around z."""
     rim = moved(torus(radius, 0.04 * radius), pose_matrix(exponential((np.pi / 2, 0, 0))))
     hub = moved(torus(0.1 * radius, 0.04 * radius, 24), pose_matrix(exponential((np.pi / 2, 0, 0))))
-    spokes, cross = 2 * int(rng.integers(6, 13)), between(rng, 0, 0.8)
+    spokes = 2 * int(rng.integers(6, 13))
+    cross = between(rng, 0, 0.8)
     thickness = between(rng, 0.0005, 0.0012)
     rods = []
     for k in range(spokes):

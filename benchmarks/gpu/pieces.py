@@ -114,9 +114,14 @@ def run_child(piece: Piece, job: dict[str, Any], result: Path, seconds: float) -
     before = result.stat().st_mtime_ns if result.exists() else None
     with open(log, "wb") as text:
         process = subprocess.Popen(
-            piece.child, stdin=subprocess.PIPE, stdout=text, stderr=text, start_new_session=True,
-            env=SLEEPING | inherited | {"PYTHONPATH": path}, cwd=piece.out,
-        )  # fmt: skip
+            piece.child,
+            stdin=subprocess.PIPE,
+            stdout=text,
+            stderr=text,
+            start_new_session=True,
+            env=SLEEPING | inherited | {"PYTHONPATH": path},
+            cwd=piece.out,
+        )
         assert process.stdin is not None
         try:
             with contextlib.suppress(BrokenPipeError):

@@ -10,7 +10,8 @@ from typing import Any
 from job import Absent, Job
 from sizes import Sizes
 
-ENGINES, SEED = ("cuda", "llvm"), 3
+ENGINES = ("cuda", "llvm")
+SEED = 3
 
 
 def names(sizes: Sizes) -> list[str]:
@@ -64,7 +65,8 @@ def _frame(engine: str, family: str, sizes: Sizes) -> list[dict[str, Any]]:
     started = time.perf_counter()
     budget = choose_budget(scene, psnr=sizes.psnr)
     choosing = time.perf_counter() - started
-    renderer, seconds = Renderer(scene, budget=budget), []
+    renderer = Renderer(scene, budget=budget)
+    seconds = []
     for t in range(sizes.frames + 1):
         started = time.perf_counter()
         renderer.frame(t)

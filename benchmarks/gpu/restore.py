@@ -33,7 +33,9 @@ def measure(job: Job) -> list[dict[str, Any]]:
     from quiver.evaluation.cost import CostCase, CostSettings
     from quiver.evaluation.cost import measure as measure_cost
 
-    classical, kind, sizes = job.name in METHODS, pick_device("auto"), job.sizes
+    classical = job.name in METHODS
+    kind = pick_device("auto")
+    sizes = job.sizes
     name, _, precision = (job.name, "", "float32") if classical else job.name.rpartition("-")
     source, weights = (name, "none needed") if classical else weights_of(job.out, name)
     case = CostCase(source, "exact", precision)
@@ -78,5 +80,7 @@ def _error(case: Any, kind: str, sizes: Sizes) -> dict[str, Any]:
         for one, device in ((case, kind), (replace(case, precision="float32"), "cpu"))
     )
     difference = np.abs(found - exact)
-    return {"rms from float32 on cpu [% of white]": 100 * float(np.sqrt(np.mean(difference**2))),
-            "largest [% of white]": 100 * float(difference.max())}  # fmt: skip
+    return {
+        "rms from float32 on cpu [% of white]": 100 * float(np.sqrt(np.mean(difference**2))),
+        "largest [% of white]": 100 * float(difference.max()),
+    }

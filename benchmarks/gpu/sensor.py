@@ -9,8 +9,12 @@ from typing import Any
 from job import Absent, Job, median_seconds
 from sizes import Sizes
 
-THREE_BITS, PACKED = "3-bit codes", "1-bit codes, packed"
-EXPOSURE, PHOTONS, PLANE_PHOTONS = 5e-4, 3.25, 0.7  # s; expected photons per pixel of the 3-bit and the 1-bit sensor
+THREE_BITS = "3-bit codes"
+PACKED = "1-bit codes, packed"
+# s; expected photons per pixel of the 3-bit and the 1-bit sensor
+EXPOSURE = 5e-4
+PHOTONS = 3.25
+PLANE_PHOTONS = 0.7
 
 
 def names(sizes: Sizes) -> list[str]:
@@ -44,7 +48,8 @@ def _engine(where: str, sizes: Sizes) -> list[dict[str, Any]]:
     different = max(row.mismatches_per_million or 0.0 for row in report.rows)
     rows = []
     for what, model in ((THREE_BITS, "QIS 3 bits, gain 1.077"), (PACKED, "clocked SPAD, 1 bit, packed")):
-        numpy, fast = by[model, "numpy"], by[model, "fast"]
+        numpy = by[model, "numpy"]
+        fast = by[model, "fast"]
         host = f"{what}, from host to host"
         rows.append(_row("numpy", host, numpy.megapixels_per_second / 1e3))
         more = {"times NumPy": fast.times_numpy, "differing per million": fast.mismatches_per_million}
@@ -67,8 +72,10 @@ def _on_device(where: str, sizes: Sizes) -> list[dict[str, Any]]:
         from quiver.data.device_codes import codes_on_device
     except ModuleNotFoundError as error:
         return [{"by": where, "what": f"{THREE_BITS}, on the device: not measured, {error.name} is not installed"}]
-    sensor, key = quiver_physical(PHOTONS), Key(0, 1)
-    height, width = sizes.height, sizes.width
+    sensor = quiver_physical(PHOTONS)
+    key = Key(0, 1)
+    height = sizes.height
+    width = sizes.width
     light = np.random.default_rng(0).uniform(
         0, 2 * PHOTONS, (max(1, sizes.sensor_pixels // height // width), height, width)
     )
@@ -95,7 +102,9 @@ def _torch(where: str, sizes: Sizes) -> list[dict[str, Any]]:
 
     if where == "cuda" and not torch.cuda.is_available():
         raise Absent("torch finds no CUDA device here")
-    place, sensor, plane = torch.device(where), quiver_physical(PHOTONS), BinarySPAD(0.5, 25.0)
+    place = torch.device(where)
+    sensor = quiver_physical(PHOTONS)
+    plane = BinarySPAD(0.5, 25.0)
     shape = (max(1, sizes.sensor_pixels // sizes.height // sizes.width), sizes.height, sizes.width)
     rate = torch.full(shape, float(sensor.arrivals(PHOTONS, EXPOSURE)), device=place)
     share = torch.full(shape, float(1 - plane.cdf(PLANE_PHOTONS, EXPOSURE)[0]), device=place)

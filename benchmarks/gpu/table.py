@@ -46,8 +46,10 @@ def page(machine: dict[str, Any], records: dict[str, dict[str, dict[str, Any]]])
             for columns in dict.fromkeys(tuple(row) for row in rows):
                 lines += [*table(columns, [row for row in rows if tuple(row) == columns]), ""]
             open_ones = {name: record for name, record in found.items() if record["state"] != "done"}
-            lines += [f"- {name}: {record['state']}: {record.get('why') or 'the next piece continues it'}"
-                      for name, record in open_ones.items()] + [""]  # fmt: skip
+            lines += [
+                f"- {name}: {record['state']}: {record.get('why') or 'the next piece continues it'}"
+                for name, record in open_ones.items()
+            ] + [""]
     return lines
 
 

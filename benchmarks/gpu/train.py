@@ -79,7 +79,9 @@ def _data(job: Job) -> list[dict[str, Any]]:
     from qsim import backend
     from qsim.dataset import generation, recipe
 
-    sizes, spent, last = job.sizes, job.out / "data-seconds.json", time.perf_counter()
+    sizes = job.sizes
+    spent = job.out / "data-seconds.json"
+    last = time.perf_counter()
     parts = [(family, list(range(sizes.train_seeds)), "train") for family in sizes.train_families]
     parts.append((sizes.train_families[0], [sizes.train_seeds], "val"))
     scenes = "".join(SCENES.format(family=family, seeds=seeds, split=split) for family, seeds, split in parts)
@@ -112,7 +114,8 @@ def _data(job: Job) -> list[dict[str, Any]]:
             name, why = next(iter(summary.failed.items()))
             raise RuntimeError(f"{len(summary.failed)} clips failed; {name}: {why}")
     each = median([value for value in seconds.values() if isinstance(value, float)] or [float("nan")])
-    engine, frames = backend.choose().backend, sizes.train_frames
+    engine = backend.choose().backend
+    frames = sizes.train_frames
     row = {
         "data set": f"{sizes.train_height} x {sizes.train_width}, {sizes.train_psnr:g} dB",
         "engine": engine,
@@ -150,7 +153,9 @@ def _run(job: Job, network: str, precision: str) -> list[dict[str, Any]]:
     from quiver.model.presets import build
     from quiver.training.loop import train
 
-    settings, kind, ends = _settings(job, network, precision), pick_device("auto"), [time.perf_counter()]
+    settings = _settings(job, network, precision)
+    kind = pick_device("auto")
+    ends = [time.perf_counter()]
 
     def should_stop() -> bool:
         ends.append(time.perf_counter())
@@ -200,9 +205,12 @@ def _copies(job: Job) -> list[dict[str, Any]]:
 
     def seconds(pinned: bool, waiting: bool, copied: bool) -> float:
         loader = DataLoader(
-            windows, batch_sampler=Batches(settings.batch, 0, job.sizes.copied_batches), pin_memory=pinned,
-            num_workers=settings.workers, multiprocessing_context="spawn" if settings.workers else None,
-        )  # fmt: skip
+            windows,
+            batch_sampler=Batches(settings.batch, 0, job.sizes.copied_batches),
+            pin_memory=pinned,
+            num_workers=settings.workers,
+            multiprocessing_context="spawn" if settings.workers else None,
+        )
         ends = []
         for batch in loader if copied else [held] * job.sizes.copied_batches:
             moved = {name: batch[name].to(place, non_blocking=not waiting) for name in ("codes", "target")}
@@ -218,8 +226,11 @@ def _copies(job: Job) -> list[dict[str, Any]]:
 
     ways = [("pageable, waiting", (False, True, True)), ("none: one batch stays on the device", (False, True, False))]
     if place.type == "cuda":
-        ways[1:1] = [("pageable, not waiting", (False, False, True)), ("pinned, waiting", (True, True, True)),
-                     ("pinned, not waiting (what training does)", (True, False, True))]  # fmt: skip
+        ways[1:1] = [
+            ("pageable, not waiting", (False, False, True)),
+            ("pinned, waiting", (True, True, True)),
+            ("pinned, not waiting (what training does)", (True, False, True)),
+        ]
     return [
         {
             "copies of batches": name,

@@ -81,14 +81,16 @@ def _summed(at: Array, noise: float, mean: Array, spread: Array) -> Array:
     window = ceil(2 * REACH * noise) + 2
     if len(electrons) <= 2 * window:
         z = (at - electrons[:, None]) / noise
-        phi, density = ndtr(z), np.exp(-0.5 * z * z) / (sqrt(2 * pi) * noise)
+        phi = ndtr(z)
+        density = np.exp(-0.5 * z * z) / (sqrt(2 * pi) * noise)
         by_noise = -(weights @ (z * density))
         return np.stack([weights @ phi, weights @ density, by_noise, by_mean @ phi, by_spread @ phi])
     # few electrons lie near a threshold; of those below it only the total counts
     first = np.clip(np.floor(at - REACH * noise - electrons[0]), 0, len(electrons) - window).astype(int)
     near = first[:, None] + np.arange(window)
     z = (at[:, None] - electrons[near]) / noise
-    phi, density = ndtr(z), np.exp(-0.5 * z * z) / (sqrt(2 * pi) * noise)
+    phi = ndtr(z)
+    density = np.exp(-0.5 * z * z) / (sqrt(2 * pi) * noise)
 
     def below(mass: Array) -> Array:
         total = np.concatenate([np.zeros((len(mass), 1)), np.cumsum(mass, axis=1)], axis=1)

@@ -58,7 +58,8 @@ class Correlations:
 
 def measure_correlations(stacks: Sequence[FrameStatistics], bits: int) -> Correlations:
     """Return afterpulsing and crosstalk from all stacks; sums of planes and one or two frames tell neither."""
-    after, cross = Chance(), Chance()
+    after = Chance()
+    cross = Chance()
     for _ in range(3):  # each changes the other a little
         after = _combined([_afterpulsing(stack, bits, after.value) for stack in stacks])
         cross = _combined([_crosstalk(stack, bits, cross.value) for stack in stacks])

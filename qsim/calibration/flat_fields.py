@@ -39,8 +39,12 @@ class DarkRates:
 def dark_rates(darks: Sequence[FrameStatistics], response: Response) -> DarkRates:
     """Return the dark rate of every pixel [1/s] from all exposures in which it is not nearly saturated."""
     shape = darks[0].total.shape
-    weight, rate, variance = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    missing, frames, exposure = np.full(shape, -1.0), np.zeros(shape), np.zeros(shape)
+    weight = np.zeros(shape)
+    rate = np.zeros(shape)
+    variance = np.zeros(shape)
+    missing = np.full(shape, -1.0)
+    frames = np.zeros(shape)
+    exposure = np.zeros(shape)
     for stack in sorted(darks, key=lambda one: one.exposure):
         here = response.at(stack.exposure)
         arrivals = response.of_stack(stack)
@@ -132,7 +136,8 @@ def qis_flats(
     found = []
     for flat in flats:
         dark, of_dark = _dark_level(darks, flat.exposure)
-        mean, average = flat.total / flat.frames, float(dark[good].mean())
+        mean = flat.total / flat.frames
+        average = float(dark[good].mean())
         if float(mean[good].mean()) <= average:
             continue
         zero = float(sensor.mean(np.array(0.0), 1.0))

@@ -140,7 +140,9 @@ def measure(
         frames += len(values)
     if sums is None:
         raise ValueError(f"{name}: has no frames")
-    total, square, lagged = sums["total"], sums["square"], sums["lagged"]
+    total = sums["total"]
+    square = sums["square"]
+    lagged = sums["lagged"]
     return FrameStatistics(
         frames,
         float(exposure),
@@ -169,11 +171,14 @@ def measure_sums(
     if planes < 1:
         raise ValueError(f"{name}: sums hold at least 1 plane, got {planes}")
     _check_light(exposure, photons, name)
-    ones, squares, frames = None, None, 0
+    ones = None
+    squares = None
+    frames = 0
     for block in blocks:
         sums = _as_values(block, planes, f"sum of {planes} planes", name, frames).astype(np.float64)
         if ones is None or squares is None:
-            ones, squares = np.zeros(sums.shape[1:]), np.zeros(sums.shape[1:])
+            ones = np.zeros(sums.shape[1:])
+            squares = np.zeros(sums.shape[1:])
         elif sums.shape[1:] != ones.shape:
             raise ValueError(f"{name}: frame {frames} is {sums.shape[1:]}, the frames before are {ones.shape}")
         ones += sums.sum(axis=0)
@@ -181,7 +186,8 @@ def measure_sums(
         frames += len(sums)
     if ones is None or squares is None:
         raise ValueError(f"{name}: has no frames")
-    drawn, unknown = frames * planes, np.full(ones.shape, np.nan)
+    drawn = frames * planes
+    unknown = np.full(ones.shape, np.nan)
     histogram = np.array([ones.size * drawn - ones.sum(), ones.sum()]).astype(np.int64)
     statistics = FrameStatistics(drawn, float(exposure), photons, histogram, ones, ones, unknown, unknown, unknown)
     if frames < 2 or planes < 2:

@@ -45,7 +45,8 @@ def pooled(observed: Array, expected: Array, least: float = 5.0) -> tuple[Array,
     """Join neighbouring bins until each expects at least `least`; return observed and expected counts."""
     enough = least - 1e-9 * float(expected.sum())  # rounding of the expected sum must not join two bins
     group = np.zeros(len(expected), dtype=int)
-    number, inside = 0, 0.0
+    number = 0
+    inside = 0.0
     for i, count in enumerate(expected.tolist()):
         group[i] = number
         inside += count

@@ -117,8 +117,11 @@ class Likelihood:
         return np.where(self.dark, 0.0, (self.excess if excess is None else excess) / (gain * self.response) ** 2)
 
     def laws(self, parameters: Array, excess: Array | None = None) -> tuple[Law, ...]:
-        gain, offset, noise = exp(parameters[GAIN]), float(parameters[OFFSET]), exp(parameters[NOISE])
-        mean, spread = self.means(parameters), self.spreads(gain, excess)
+        gain = exp(parameters[GAIN])
+        offset = float(parameters[OFFSET])
+        noise = exp(parameters[NOISE])
+        mean = self.means(parameters)
+        spread = self.spreads(gain, excess)
         return tuple(
             code_law(
                 panel.edges,
@@ -155,13 +158,16 @@ class Likelihood:
 
     def moments_at(self, parameters: Array) -> tuple[Array, Array]:
         """Return mean and variance of the cells of which nothing else is used."""
-        gain, offset, noise = exp(parameters[GAIN]), float(parameters[OFFSET]), exp(parameters[NOISE])
+        gain = exp(parameters[GAIN])
+        offset = float(parameters[OFFSET])
+        noise = exp(parameters[NOISE])
         return self.moments.laws(gain, offset, noise, self.means(parameters)[self.simple])
 
     def moment_slopes(self, parameters: Array) -> tuple[Array, Array]:
         """Return the derivatives of both by ln gain, offset, ln read noise, dark and own electrons: [5, cells]."""
         electrons = self.means(parameters)[self.simple]
-        share, own = self.share[self.simple], ~self.dark[self.simple]
+        share = self.share[self.simple]
+        own = ~self.dark[self.simple]
         of_mean, of_variance = self.moments.slopes(exp(parameters[GAIN]), exp(parameters[NOISE]), electrons)
         parts = np.stack([np.ones_like(share), np.ones_like(share), np.ones_like(share), share, own])
         rows = [0, 1, 2, 3, 3]
@@ -179,7 +185,9 @@ class Likelihood:
     def at(self, parameters: Array) -> State:
         """Return value, score and information at some parameters."""
         laws = self.laws(parameters)
-        value, score, information = 0.0, np.zeros(self.size), np.zeros((self.size, self.size))
+        value = 0.0
+        score = np.zeros(self.size)
+        information = np.zeros((self.size, self.size))
 
         def add(members: Array, pushes: Array, fisher: Array) -> None:
             """Add the score [5, cells] and the information [5, 5, cells] of cells."""
@@ -283,7 +291,8 @@ class Likelihood:
                     pushes[cell.pixels, self.own[i]] += terms[SHARED]
                 pushes[cell.pixels, :SHARED] += terms[:SHARED].T
         if self.simple.size:
-            laws, steepness = self.moments_at(state.parameters), self.moment_slopes(state.parameters)
+            laws = self.moments_at(state.parameters)
+            steepness = self.moment_slopes(state.parameters)
             for r, i in enumerate(self.simple):
                 cell = self.cells[i]
                 terms = self.moments.pushes(r, *laws, *steepness)

@@ -125,7 +125,8 @@ class _Search:
         The search starts at the fit, or at another maximum of the likelihood.
         """
         self.last = mode or self.fit.state
-        near, at_near = float(self.direction @ self.last.parameters), self.root_of(self.last)
+        near = float(self.direction @ self.last.parameters)
+        at_near = self.root_of(self.last)
         far = near + side * sqrt(max(target**2 - at_near**2, 0.1)) * self.error
         if side < 0:
             far = max(far, bound)
@@ -139,7 +140,8 @@ class _Search:
                 return bound, False
             if abs(far - self.value) > self.farthest:
                 return side * inf, False
-            near, at_near = far, found
+            near = far
+            at_near = found
             far = self.value + (far - self.value) * min(max(1.1 * target / max(found, 1e-3), 1.2), 3.0)
             if side < 0:
                 far = max(far, bound)
@@ -153,7 +155,9 @@ class _Search:
             if abs(found / target - 1) < CLOSE:
                 return middle, False
             if found < target:
-                near, at_near = middle, found
+                near = middle
+                at_near = found
             else:
-                far, at_far = middle, found
+                far = middle
+                at_far = found
         return far, False

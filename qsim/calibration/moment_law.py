@@ -62,7 +62,8 @@ class MomentLaw:
 
     def slopes(self, gain: float, noise: float, electrons: Array) -> tuple[Array, Array]:
         """Return the derivatives [4, R] of mean and variance by ln gain, offset, ln read noise and electrons."""
-        one, zero = np.ones_like(electrons), np.zeros_like(electrons)
+        one = np.ones_like(electrons)
+        zero = np.zeros_like(electrons)
         of_mean = np.stack([gain * electrons, one, zero, gain * one])
         squared = gain**2 * one
         of_variance = np.stack([2 * squared * (electrons + noise**2), zero, 2 * squared * noise**2, squared])

@@ -33,7 +33,8 @@ def photon_transfer(cells: Sequence[Cell], exposures: Sequence[float], darks: in
     level = np.stack([stacks[i][1] for i in used])
     in_time = np.stack([stacks[i][2] for i in used])
     pixels = level.shape[1]
-    mean, variance = level.mean(axis=1), in_time.mean(axis=1)
+    mean = level.mean(axis=1)
+    variance = in_time.mean(axis=1)
     gain = max(float((variance[-1] - variance[0]) / max(mean[-1] - mean[0], 1e-9)), 1e-9)
     for _ in range(4):
         residual = in_time - gain * level

@@ -163,7 +163,8 @@ def _of_all(flat: Flat, good: Array) -> Value:
     basis = surface(flat.raw.shape, int(good.sum()))
     fitted = smooth_part(basis, flat.raw.ravel(), good.ravel())
     residual = flat.raw.ravel() - fitted
-    square, noise = float(residual.var(ddof=basis.shape[1])), float(flat.noise.mean())
+    square = float(residual.var(ddof=basis.shape[1]))
+    noise = float(flat.noise.mean())
     of_square = float(np.var((residual - residual.mean()) ** 2)) / residual.size
     lever = noise / relative_noise(flat, good) if noise > 0 else float(np.mean(fitted - flat.codes[0])) ** 2
     low, high = (max(v, 0.0) / lever for v in difference_interval(square, of_square, noise, 0.0))
@@ -174,9 +175,11 @@ def _of_all(flat: Flat, good: Array) -> Value:
 def _of_good(flat: Flat, good: Array) -> tuple[Value, float]:
     """Return the PRNU of the good pixels with its interval, and the rms of the shading."""
     basis = surface(flat.mean.shape, int(good.sum()))[good.ravel()]
-    level, noise = flat.mean[good], flat.noise[good]
+    level = flat.mean[good]
+    noise = flat.noise[good]
     model = _Model(flat)
-    weights, s = np.ones_like(level), 0.1
+    weights = np.ones_like(level)
+    s = 0.1
     for _ in range(4):
         root = np.sqrt(weights)
         orthonormal, _ = np.linalg.qr(basis * root[:, None])
@@ -188,7 +191,8 @@ def _of_good(flat: Flat, good: Array) -> tuple[Value, float]:
         shape = np.maximum(model.variance(fitted, max(s, 0.01)), 1e-30)
         total = shape + even
         gain = shape / total**2
-        observed, explained = float(gain @ squares), float(gain @ noise)
+        observed = float(gain @ squares)
+        explained = float(gain @ noise)
         s = model.inverse(fitted, gain, observed - explained)
         weights = 1 / (np.maximum(model.variance(fitted, max(s, 0.01)), 1e-30) + even)
         weights /= weights.mean()
@@ -240,7 +244,8 @@ class _Model:
             return 0.0
         edges = np.linspace(float(expected.min()), float(expected.max()), 65)
         place = np.clip(np.searchsorted(edges, expected) - 1, 0, 63)
-        middles, sums = (edges[1:] + edges[:-1]) / 2, np.bincount(place, gain, 64)
+        middles = (edges[1:] + edges[:-1]) / 2
+        sums = np.bincount(place, gain, 64)
         steps = np.linspace(0, sqrt(STEEPEST), 41) ** 2
         table = np.array([float(sums @ self.variance(middles, s)) for s in steps])
         end = int(np.argmax(table)) + 1

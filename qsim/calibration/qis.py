@@ -168,7 +168,9 @@ def _without_dark_current(fit: Fit, values: dict[str, Value]) -> dict[str, Value
     start[NOISE] = 0.5 * log(fit.noise**2 + start[DARK])
     start[DARK] = 0.0
     none = fit.likelihood.maximise(start, hold=np.eye(fit.likelihood.size)[DARK])
-    offset, noise, dark = values["offset"], values["read_noise"], values["dark_current"]
+    offset = values["offset"]
+    noise = values["read_noise"]
+    dark = values["dark_current"]
     shift = float(none.parameters[OFFSET]) - offset.value
     factor = exp(none.parameters[NOISE]) / noise.value
     return {
@@ -187,7 +189,8 @@ def _efficiency(fit: Fit, flats: Sequence[FrameStatistics], exposures: Sequence[
     known = [i for i, flat in enumerate(flats) if flat.photons]
     if not known:
         return {}
-    likelihood, covariance = fit.likelihood, fit.covariance
+    likelihood = fit.likelihood
+    covariance = fit.covariance
     directions = np.zeros((len(known), likelihood.size))
     own = np.zeros(len(known))  # variance that the flats do not share
     for row, i in enumerate(known):
@@ -208,7 +211,8 @@ def _efficiency(fit: Fit, flats: Sequence[FrameStatistics], exposures: Sequence[
     direction = weights @ directions
     value = float(weights @ found)
     interval = profile(fit, direction, max(0.3 * abs(value), 1e-9), 1e3 * max(abs(value), 1e-9))
-    low, high = interval.low, interval.high
+    low = interval.low
+    high = interval.high
     method = "light standard, whose light is taken as exact"
     if len(known) > 1:
         freedom = len(known) - 1
@@ -255,7 +259,8 @@ def _of_pattern(values: dict[str, Value]) -> dict[str, Value]:
 def _goodness(fit: Fit, stacks: int, bits: int) -> tuple[float, tuple[Array, ...]]:
     """Return the chi-square p-value of all cells, and the residuals of every stack by code [levels] in sigmas."""
     histograms = []
-    observed, expected = np.zeros((stacks, 1 << bits)), np.zeros((stacks, 1 << bits))
+    observed = np.zeros((stacks, 1 << bits))
+    expected = np.zeros((stacks, 1 << bits))
     for panel, law in zip(fit.likelihood.panels, fit.state.laws, strict=True):
         codes = np.clip(np.rint(panel.middle), 0, (1 << bits) - 1).astype(int)
         for r, i in enumerate(panel.cells):
@@ -266,7 +271,8 @@ def _goodness(fit: Fit, stacks: int, bits: int) -> tuple[float, tuple[Array, ...
     residuals = (observed - expected) / np.sqrt(np.maximum(expected, 1.0))
     simple = fit.likelihood.simple
     own = int(np.count_nonzero(~fit.likelihood.dark[simple]))  # parameters that the mean of a cell determines
-    misfit, freedom = 0.0, 0
+    misfit = 0.0
+    freedom = 0
     if simple.size:
         misfit = fit.likelihood.moments.misfit(fit.likelihood.moments_at(fit.state.parameters)[1])
         freedom = simple.size

@@ -160,7 +160,8 @@ def sensor_of(found: Calibration) -> Sensor:
         return QIS(
             efficiency, value["dark_current"], value["read_noise"], found.bits, value["gain"], offset=value["offset"]
         )
-    efficiency, dark = min(value.get("pde_fill", 1.0), 1.0), value.get("dark_count_rate", 0.0)
+    efficiency = min(value.get("pde_fill", 1.0), 1.0)
+    dark = value.get("dark_count_rate", 0.0)
     if found.model == "BinarySPAD":
         return BinarySPAD(efficiency, dark, found.bits)
     return CountingSPAD(efficiency, dark, value.get("dead_time", 0.0), found.bits, found.paralyzable)

@@ -161,7 +161,8 @@ class _Array:
 
         Each is moved to the ends of its 95 % interval. Afterpulsing and crosstalk move the dead time too.
         """
-        down, up = np.zeros_like(base), np.zeros_like(base)
+        down = np.zeros_like(base)
+        up = np.zeros_like(base)
         moves = []
         if self.ratio is not None:
             moves += [quantity(replace(self.response, ratio=end)) - base for end in self.ratio.ends]
@@ -175,7 +176,8 @@ class _Array:
 
     def _moved(self) -> list[Response]:
         """Return the responses with afterpulsing and crosstalk at the ends of their intervals, if measured."""
-        after, cross = self.correlations.afterpulsing, self.correlations.crosstalk
+        after = self.correlations.afterpulsing
+        cross = self.correlations.crosstalk
         found = []
         if after.variance is not None:
             found.append(replace(self.response, afterpulsing=after.value + Z95 * after.sigma))
@@ -235,7 +237,8 @@ def _distribution(dark: DarkRates) -> Distribution:
 
 def _dark_values(array: _Array) -> dict[str, Value]:
     """Return mean, median and percentiles of the dark rate, and the number of hot pixels."""
-    dark, hot = array.dark, array.hot
+    dark = array.dark
+    hot = array.hot
     assert dark is not None
     assert array.found is not None
     everywhere = np.ones_like(hot)
@@ -287,7 +290,8 @@ def _mean_rate(array: _Array, dark: DarkRates, chosen: Array) -> Value:
 
 def _near_saturation(dark: DarkRates, near: Array, response: Response) -> tuple[float, float]:
     """Return the summed squares of the distances to the ends of each nearly saturated pixel's interval, (1/s)^2."""
-    below, above = 0.0, 0.0
+    below = 0.0
+    above = 0.0
     for missing, frames, exposure, rate in zip(
         dark.missing[near], dark.frames[near], dark.exposure[near], dark.rate[near], strict=True
     ):
@@ -309,7 +313,8 @@ def _near_saturation(dark: DarkRates, near: Array, response: Response) -> tuple[
 
 def _dark_remarks(array: _Array) -> list[str]:
     """Return remarks about dark frames without counts, saturated pixels and percentiles that are left out."""
-    dark, found = array.dark, array.found
+    dark = array.dark
+    found = array.found
     assert dark is not None
     assert found is not None
     words = []
@@ -368,7 +373,8 @@ def _efficiency(array: _Array) -> tuple[dict[str, Value], list[str]]:
         covariance = covariance * max(scatter, 1.0)
     down, up = array.reach(lambda response: np.array([weights @ slopes(response)]), np.array([value]))
     square = Z95**2 * float(weights @ covariance @ weights)
-    low, high = value - sqrt(square + float(down[0])), value + sqrt(square + float(up[0]))
+    low = value - sqrt(square + float(down[0]))
+    high = value + sqrt(square + float(up[0]))
     found = Value(max(value, 0.0), max(low, 0.0), max(high, 0.0), "counts/photon", "light standard")
     return {"pde_fill": found}, words + odd_efficiency(found)
 
@@ -426,7 +432,8 @@ def _goodness(array: _Array) -> tuple[float, tuple[Array, ...]]:
     """
     if array.response.bits == 1 or not array.flats:
         return nan, ()
-    good, spread = array.good, _spread(array)
+    good = array.good
+    spread = _spread(array)
     shares = []
     for flat in array.flats:
         here = array.response.at(flat.exposure)

@@ -120,7 +120,8 @@ def electron_peaks(cells: Sequence[Cell], gain: float) -> list[Peaks]:
     share = histogram / histogram.sum()
     size = 1 << int(np.ceil(np.log2(max(PADDING * highest, 1024))))
     size_of = np.abs(np.fft.fft(share, size))
-    first, last = int(size / (1.4 * gain)), min(int(size / (0.7 * gain)) + 1, int(0.97 * size))
+    first = int(size / (1.4 * gain))
+    last = min(int(size / (0.7 * gain)) + 1, int(0.97 * size))
     inner = size_of[first:last]
     if len(inner) < 3:
         return []
@@ -131,7 +132,8 @@ def electron_peaks(cells: Sequence[Cell], gain: float) -> list[Peaks]:
     height = float(inner[best])
     if height < CLEAR / sqrt(histogram.sum()):
         return []
-    left, right = inner[best - 1], inner[best + 1]
+    left = inner[best - 1]
+    right = inner[best + 1]
     turn = 0.5 * (left - right) / (left - 2 * height + right)
     frequency = (first + best + turn) / size
     codes = np.arange(highest)

@@ -15,11 +15,14 @@ from qsim.cli.reader_options import LAYOUT, add_reader_options, hints_of
 def add_calibrate(sub: Any) -> None:
     """Add the command `calibrate` to a program."""
     parser = command(
-        sub, "calibrate", _run_calibrate, "Measure a sensor from dark and flat frames; write its file.",
+        sub,
+        "calibrate",
+        _run_calibrate,
+        "Measure a sensor from dark and flat frames; write its file.",
         "qsim calibrate --bits 8 --dark d1.npy 1e-3 --dark d2.npy 0.1 --flat f.npy 1e-3 --flat g.npy 1e-3 -o my.toml\n"
         "qsim calibrate --model spad --bits 1 --dark dark.npy 1e-5 --flat flat.npy 1e-5 0.8 -o spad.toml\n"
         "qsim calibrate --bits 8 --static counts.npy 6.33e-6 -o counter.toml",
-    )  # fmt: skip
+    )
     for option, names, what in (
         ("--dark", ("FILE", "SECONDS"), "frames without light, and their exposure"),
         ("--flat", ("FILE", "SECONDS"), "evenly lit frames, their exposure, and the photons per pixel if known"),
@@ -113,16 +116,28 @@ def _calibration_kind(args: argparse.Namespace) -> tuple[str, int]:
     model = args.model or ("spad" if args.static or args.planes is not None else "qis")
     for option, given, acts, why in (
         ("--model qis", args.static and args.model == "qis", False, "--static finds the dead time of a counting SPAD"),
-        ("--planes", args.planes is not None and model == "qis", False, "a QIS is calibrated from its own codes; for "
-         "sums of binary planes add --model spad"),
+        (
+            "--planes",
+            args.planes is not None and model == "qis",
+            False,
+            "a QIS is calibrated from its own codes; for sums of binary planes add --model spad",
+        ),
         ("--planes", sums and args.static, False, "binary planes have no dead time for --static to find"),
-        ("--ignore-dead-time", args.ignore_dead_time, model == "spad" and not args.static, "it is for --model spad "
-         "with dark and flat frames"),
+        (
+            "--ignore-dead-time",
+            args.ignore_dead_time,
+            model == "spad" and not args.static,
+            "it is for --model spad with dark and flat frames",
+        ),
         ("--paralyzable", args.paralyzable, model == "spad", "it is for --model spad and --static"),
         ("--paralyzable", args.paralyzable and args.ignore_dead_time, False, "--ignore-dead-time takes no dead time"),
-        ("--width", args.width is not None and _packed(args) and (sums or args.static is not None), False, "it is for "
-         "packed binary planes, which are read one by one"),
-    ):  # fmt: skip
+        (
+            "--width",
+            args.width is not None and _packed(args) and (sums or args.static is not None),
+            False,
+            "it is for packed binary planes, which are read one by one",
+        ),
+    ):
         if given and not acts:
             raise ValueError(f"{option}: {why}; leave it out")
     if sums and args.bits not in (None, 1):
@@ -164,7 +179,8 @@ def _static(args: argparse.Namespace, bits: int) -> Any:
     from qsim.calibration.dead_time import calibrate_static
     from qsim.calibration.sensor_file import read_counts
 
-    path, exposure = Path(args.static[0]), _number(args.static[1])
+    path = Path(args.static[0])
+    exposure = _number(args.static[1])
     counts = read_counts(path, hints_of(args, LAYOUT), bits, exposure)
     return calibrate_static(counts, bits=bits, exposure=exposure, paralyzable=args.paralyzable, name=str(path))
 

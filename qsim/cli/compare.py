@@ -21,10 +21,12 @@ _HEADER = ("stream", "sensor", "bits", "codes", "time [ms]", "photons", "PSNR [d
 def add_compare(sub: Any) -> None:
     """Add the command `compare` to a program."""
     parser = command(
-        sub, "compare", _run_compare, "Compare the streams of a clip: each averaged over the same span of time.",
-        "qsim compare out/readouts/clips/fan_0000\n"
-        "qsim compare out/fan --streams spike,conventional --span 0.6e-3",
-    )  # fmt: skip
+        sub,
+        "compare",
+        _run_compare,
+        "Compare the streams of a clip: each averaged over the same span of time.",
+        "qsim compare out/readouts/clips/fan_0000\nqsim compare out/fan --streams spike,conventional --span 0.6e-3",
+    )
     parser.add_argument("clip", type=Path, help="clip folder with streams")
     parser.add_argument("--streams", type=words, help="names of streams, comma-separated (default: all)")
     parser.add_argument("--span", type=positive, help="seconds that are averaged (default: the longest code)")

@@ -28,11 +28,14 @@ def add_completion(sub: Any, parser: argparse.ArgumentParser, values: Values) ->
 
     prog = parser.prog
     own = command(
-        sub, "completion", _run_completion, "Print a script that completes commands and options in your shell.",
+        sub,
+        "completion",
+        _run_completion,
+        "Print a script that completes commands and options in your shell.",
         f"{prog} completion bash >> ~/.bashrc\n"
         f"{prog} completion zsh >> ~/.zshrc\n"
         f"{prog} completion fish > ~/.config/fish/completions/{prog}.fish",
-    )  # fmt: skip
+    )
     own.add_argument("shell", choices=SHELLS, help="the shell")
 
 
@@ -76,7 +79,8 @@ def _words(parser: argparse.ArgumentParser, values_of: ValuesOf) -> list[str]:
 
 
 def _bash(parser: argparse.ArgumentParser, shell: str, values_of: ValuesOf) -> str:
-    prog, commands = parser.prog, options_of(parser).commands
+    prog = parser.prog
+    commands = options_of(parser).commands
     lines = ["autoload -U +X bashcompinit && bashcompinit"] if shell == "zsh" else []
     lines += [
         f"_{prog}_complete() {{",
@@ -108,7 +112,8 @@ def _bash(parser: argparse.ArgumentParser, shell: str, values_of: ValuesOf) -> s
 
 
 def _fish(parser: argparse.ArgumentParser, values_of: ValuesOf) -> str:
-    prog, commands = parser.prog, options_of(parser).commands
+    prog = parser.prog
+    commands = options_of(parser).commands
     lines = []
     for name, own in commands.items():
         what = shlex.quote(own.description or "")

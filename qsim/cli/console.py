@@ -249,7 +249,8 @@ def _run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
     finally:
         quiet.reset(token)
         if args.verbose:
-            spent, memory = time.perf_counter() - started, peak_memory() / 2**30
+            spent = time.perf_counter() - started
+            memory = peak_memory() / 2**30
             print(f"{parser.prog}: {spent:.1f} s, at most {memory:.2f} GiB of memory", file=sys.stderr)
 
 
@@ -346,7 +347,8 @@ def bar(label: str, unit: str = "frame", first: str = "") -> Iterator[Progress]:
     from tqdm import tqdm
 
     label = printable(label)
-    interval, silent = 0.2 if sys.stderr.isatty() else 10.0, quiet.get()
+    interval = 0.2 if sys.stderr.isatty() else 10.0
+    silent = quiet.get()
     options = {"unit": unit, "delay": SHOWN_AFTER, "mininterval": interval, "dynamic_ncols": True, "disable": silent}
     with tqdm(desc=label, file=sys.stderr, **options) as shown:
 

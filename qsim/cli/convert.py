@@ -24,7 +24,10 @@ _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs", ".d
 def add_convert(sub: Any) -> None:
     """Add the command `convert` to a program."""
     parser = command(
-        sub, "convert", _run_convert, "Read foreign recordings as clips or streams; write ours for others.",
+        sub,
+        "convert",
+        _run_convert,
+        "Read foreign recordings as clips or streams; write ours for others.",
         "qsim convert ball.npy out/ball --frame-rate 30000 --exposure 20e-6 --transfer linear\n"
         "qsim convert camera.tif out/camera --frame-rate 1000 --transfer linear --white 4095\n"
         "qsim convert I2-2000FPS/test out/i2_test --frame-rate 2000 --transfer 'gamma 2.2' --split test\n"
@@ -34,7 +37,7 @@ def add_convert(sub: Any) -> None:
         "qsim convert out/challenge out/cubes --to challenge\n"
         "qsim convert out/room out/room_poses --to nerfstudio\n"
         "qsim convert out/fan/streams/spad.json out/fan_cube.npy",
-    )  # fmt: skip
+    )
     parser.add_argument("input", type=Path, help="a file, a folder, a clip, a stream (its .npy or .json), a data set")
     parser.add_argument(
         "output", type=Path, help="clip folder, stream name, .npy, .mp4 or .zarr, or a folder with --to"
@@ -82,8 +85,19 @@ def _is_stream(path: Path) -> bool:
     return path.suffix == ".json" and path.is_file() and "ppp_factor" in files.read_json(path)
 
 
-_READING = (*LAYOUT, "frame_rate", "exposure", "bits", "stretched", "columns", "black", "keep_gaps", "sensor", "ppp",
-            "split")  # fmt: skip
+_READING = (
+    *LAYOUT,
+    "frame_rate",
+    "exposure",
+    "bits",
+    "stretched",
+    "columns",
+    "black",
+    "keep_gaps",
+    "sensor",
+    "ppp",
+    "split",
+)
 
 
 def _refuse_what_cannot_act(args: argparse.Namespace, kind: str, light: bool) -> None:
@@ -212,7 +226,8 @@ def _restored(source: Path) -> dict[str, Any]:
 
 def _size(made: Clip | Stream) -> str:
     frames, height, width = made.shape
-    rate, exposure = float(made.meta["frame_rate"]), made.exposure
+    rate = float(made.meta["frame_rate"])
+    exposure = made.exposure
     said = f"{frames} frames of {height} x {width} pixels at {rate:g} per second, exposure {exposure * 1e6:.4g} us"
     times = made.meta.get("times")
     if times is None:

@@ -20,11 +20,14 @@ from qsim.dataset.recipe import Recipe
 def add_generate(sub: Any) -> None:
     """Add the command `generate` to a program."""
     parser = command(
-        sub, "generate", _run_generate, "Make a data set from a recipe; finished jobs are kept.",
-        "qsim generate starter -o out/starter --workers 2\n"
-        "qsim generate mine.toml -o /data/mine --shard 7/100", RESUMES,
+        sub,
+        "generate",
+        _run_generate,
+        "Make a data set from a recipe; finished jobs are kept.",
+        "qsim generate starter -o out/starter --workers 2\nqsim generate mine.toml -o /data/mine --shard 7/100",
+        RESUMES,
         threads="threads of the renderer (Dr.Jit) in each worker",
-    )  # fmt: skip
+    )
     parser.add_argument("recipe", type=Path, help="a .toml file, or a name of `qsim recipes`")
     parser.add_argument("-o", "--output", type=Path, help="data set folder (default out/NAME of the recipe)")
     parser.add_argument("--workers", type=int, help="processes, each with its own renderer (default 1)")
@@ -121,10 +124,13 @@ def _cluster(args: argparse.Namespace) -> Any:
 def add_plan(sub: Any) -> None:
     """Add the command `plan` to a program."""
     parser = command(
-        sub, "plan", _run_plan, "Render one small job of each kind and print the forecast of a recipe's cost.",
+        sub,
+        "plan",
+        _run_plan,
+        "Render one small job of each kind and print the forecast of a recipe's cost.",
         "qsim plan i2_2000fps --machines 10",
         threads="threads of the renderer (Dr.Jit)",
-    )  # fmt: skip
+    )
     parser.add_argument("recipe", type=Path, help="a .toml file, or a name of `qsim recipes`")
     parser.add_argument("--machines", type=int, default=10, help="number of machines that share the work (default 10)")
     parser.add_argument("--frames", type=int, default=5, help="frames rendered per kind (default 5)")
@@ -149,9 +155,12 @@ def _run_plan(args: argparse.Namespace) -> int:
 def add_recipes(sub: Any) -> None:
     """Add the command `recipes` to a program."""
     parser = command(
-        sub, "recipes", _run_recipes, "List the shipped recipes and what each one makes, or print one.",
+        sub,
+        "recipes",
+        _run_recipes,
+        "List the shipped recipes and what each one makes, or print one.",
         "qsim recipes\nqsim recipes --print starter > mine.toml\nqsim recipes --keys",
-    )  # fmt: skip
+    )
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument("--print", metavar="NAME", help="print the text of this recipe")
     instead.add_argument("--keys", action="store_true", help="print the keys of a recipe, and what each accepts")
@@ -186,9 +195,12 @@ def print_keys(args: argparse.Namespace, sections: Mapping[str, Sequence[documen
 def add_sensors(sub: Any) -> None:
     """Add the command `sensors` to a program."""
     parser = command(
-        sub, "sensors", _run_sensors, "List the named sensors, or the keys of a sensor file.",
+        sub,
+        "sensors",
+        _run_sensors,
+        "List the named sensors, or the keys of a sensor file.",
         "qsim sensors\nqsim sensors --keys",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "--keys", action="store_true", help="print the keys of a sensor file instead, and what each accepts"
     )
@@ -219,10 +231,12 @@ def _contents(jobs: Sequence[Job]) -> str:
 def add_check(sub: Any) -> None:
     """Add the command `check` to a program."""
     parser = command(
-        sub, "check", _run_check, "Compare files with their checksums; exit code 1 if one is damaged.",
-        "qsim check out/starter out/fan out/fan_restored.npy\n"
-        "qsim check out/starter --redraw",
-    )  # fmt: skip
+        sub,
+        "check",
+        _run_check,
+        "Compare files with their checksums; exit code 1 if one is damaged.",
+        "qsim check out/starter out/fan out/fan_restored.npy\nqsim check out/starter --redraw",
+    )
     parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="data sets, clips, streams, restored video")
     parser.add_argument(
         "--redraw",

@@ -36,9 +36,13 @@ METHODS = ("naive:1", "naive:11", "moment:3", "qbp-bm3d", NETWORK)
 def add_demo(sub: Any) -> None:
     """Add the command `demo` to a program."""
     parser = command(
-        sub, "demo", _run_demo, "Render, sense, train, restore and score small scenes; write one page of the results.",
-        "qsim demo\nqsim demo out/demo", RESUMES,
-    )  # fmt: skip
+        sub,
+        "demo",
+        _run_demo,
+        "Render, sense, train, restore and score small scenes; write one page of the results.",
+        "qsim demo\nqsim demo out/demo",
+        RESUMES,
+    )
     parser.add_argument("folder", type=Path, nargs="?", default=Path("out/demo"), help="to fill (default out/demo)")
 
 
@@ -49,7 +53,8 @@ def _run_demo(args: argparse.Namespace) -> int:
     for package in OPTIONAL["networks"][0]:
         if not find_spec(package):
             raise ModuleNotFoundError(f"No module named {package!r}", name=package)
-    started, out = time.perf_counter(), args.folder
+    started = time.perf_counter()
+    out = args.folder
     claim(out)
     try:
         steps(out, args.quiet or args.json)
@@ -57,7 +62,8 @@ def _run_demo(args: argparse.Namespace) -> int:
         step = shlex.join(error.cmd[2:])
         again = shlex.join(["qsim", "demo", str(out)])
         return failed(f"qsim demo: stopped at '{step}'; `{again}` resumes there", error.returncode, args.json)
-    minutes, peak = (time.perf_counter() - started) / 60, peak_memory_of_children()
+    minutes = (time.perf_counter() - started) / 60
+    peak = peak_memory_of_children()
     page = out / "index.html"
     facts = {"page": str(page), "minutes": minutes, "largest_process_bytes": peak}
     output(args, facts, f"\ndemo: {minutes:.1f} minutes, largest process {peak / 2**30:.2f} GB; open {page}")
@@ -66,7 +72,8 @@ def _run_demo(args: argparse.Namespace) -> int:
 
 def claim(out: Path) -> None:
     """Make the folder and mark it; `FileExistsError` if it holds files but not the mark: somebody else's."""
-    mark, ours = out / MARK, {"format": "qsim-demo-1"}
+    mark = out / MARK
+    ours = {"format": "qsim-demo-1"}
     if mark.is_file() and not mark.is_symlink() and mark.read_bytes() == to_json(ours):
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -108,7 +115,9 @@ def steps(out: Path, quiet: bool) -> None:
         if not target.with_suffix(".json").exists():
             run(f"Restoring {source.name}", "quiver", "restore", source, "-o", target, "--method", method)
 
-    data, trained, title = out / "data", out / "trained", "From a scene to restored video"
+    data = out / "data"
+    trained = out / "trained"
+    title = "From a scene to restored video"
     run("Rendering moving scenes at 2000 fps and sensing them", "qsim", "generate", "demo", "-o", data)
     how = ("--preset", NETWORK, "--start", NETWORK, "--learning-rate", RATE, "--minutes", MINUTES, *LIGHT)
     run(f"Training the shipped {NETWORK} further on these scenes", "quiver", "train", data, "-o", trained, *how)

@@ -27,7 +27,8 @@ class Section(NamedTuple):
     name: str = ""  # of the checks; "": none, the commented lines are the keys
 
 
-_RECIPE, _SECTIONS = "qsim.dataset.recipe", "qsim.dataset.recipe_sections"
+_RECIPE = "qsim.dataset.recipe"
+_SECTIONS = "qsim.dataset.recipe_sections"
 _DEFECTS = "qsim.sensor.defects.defect_table"
 RECIPE = {
     "[recipe]": Section(_RECIPE, _RECIPE, "HEAD"),

@@ -22,12 +22,15 @@ FASTEST_GIF = 50  # frames per second; viewers slow down faster ones
 def add_preview(sub: Any) -> None:
     """Add the command `preview` to a program."""
     parser = command(
-        sub, "preview", _run_preview, "Show a clip, stream or array: in the terminal, as film or picture.",
+        sub,
+        "preview",
+        _run_preview,
+        "Show a clip, stream or array: in the terminal, as film or picture.",
         "qsim preview out/fan\n"
         "qsim preview out/fan --what flow --frame 3\n"
         "qsim preview out/fan -o out/fan.mp4 --fps 25\n"
         "qsim preview out/fan.npy -o out/fan.png --frame 10",
-    )  # fmt: skip
+    )
     parser.add_argument("path", type=Path, help="clip folder, stream (.npy or .json), or array [T, H, W] (.npy)")
     parser.add_argument(
         "-o", "--output", type=Path, help=".mp4, .gif or .png to write (default: show it in the terminal)"
@@ -136,10 +139,13 @@ def _show(args: argparse.Namespace, source: Any, views: list[Any], frames: range
 def add_report(sub: Any) -> None:
     """Add the command `report` to a program."""
     parser = command(
-        sub, "report", _run_report, "Write one self-contained page of clips, data sets, runs, restored video, scores.",
+        sub,
+        "report",
+        _run_report,
+        "Write one self-contained page of clips, data sets, runs, restored video, scores.",
         "qsim report out/fan\nqsim report out/fan out/fan.npy -o fan.html\n"
         "qsim report out/demo -o out/demo/index.html --title 'My run'",
-    )  # fmt: skip
+    )
     kinds = "clips, data sets, training runs, restored video, evaluations, or folders of some"
     parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help=kinds)
     parser.add_argument(
@@ -163,10 +169,12 @@ def _run_report(args: argparse.Namespace) -> int:
 def add_explore(sub: Any) -> None:
     """Add the command `explore` to a program."""
     parser = command(
-        sub, "explore", _run_explore,
+        sub,
+        "explore",
+        _run_explore,
         "Write a page on which sliders set light and sensor, and the codes of a clip are drawn live in the browser.",
         "qsim explore out/fan\nqsim explore out/fan -o out/fan_explore.html",
-    )  # fmt: skip
+    )
     parser.add_argument("path", type=Path, metavar="CLIP", help="clip folder")
     parser.add_argument("-o", "--output", type=Path, help=".html file to write (default: NAME_explore.html here)")
     parser.add_argument("--force", action="store_true", help="replace an existing page")

@@ -133,7 +133,8 @@ def steps(text: str) -> list[float]:
         if len(words) == 1:
             found = [float(word) for word in text.split(",")]
         else:
-            low, high = float(words[0]), float(words[1])
+            low = float(words[0])
+            high = float(words[1])
             count = int(words[2]) if len(words) == 3 else _doublings(low, high)
             found = [float(f"{v:.4g}") for v in np.geomspace(low, high, count)]
     except (ValueError, IndexError, ZeroDivisionError):

@@ -64,9 +64,12 @@ def parser() -> Parser:
 def _add_doctor(sub: Any) -> None:
     """Add the command `doctor` to a program."""
     parser = command(
-        sub, "doctor", _run_doctor, "Print the renderer of this machine, those tested, and missing optional packages.",
+        sub,
+        "doctor",
+        _run_doctor,
+        "Print the renderer of this machine, those tested, and missing optional packages.",
         "qsim doctor\nqsim doctor --devices",
-    )  # fmt: skip
+    )
     parser.add_argument("--devices", action="store_true", help="list the named sensors and the source of each number")
 
 

@@ -18,8 +18,20 @@ from qsim.formats.raw_layout import ENDIANS, ORDERS
 from qsim.formats.recording import TRANSFERS, Hints
 
 # Where the values of a file lie: for frames of light and for codes.
-LAYOUT = ("layout", "height", "width", "order", "endian", "skip_bytes", "row_padding", "axes", "channel", "slice",
-          "dataset", "variable")  # fmt: skip
+LAYOUT = (
+    "layout",
+    "height",
+    "width",
+    "order",
+    "endian",
+    "skip_bytes",
+    "row_padding",
+    "axes",
+    "channel",
+    "slice",
+    "dataset",
+    "variable",
+)
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "layout": {"help": f"kind of the input: {', '.join(detection.LAYOUTS)}"},

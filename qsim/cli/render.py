@@ -23,11 +23,14 @@ LIGHT = (
 def add_render(sub: Any) -> None:
     """Add the command `render` to a program."""
     parser = command(
-        sub, "render", _run_render, "Render a scene into a clip: radiance, sharp frames, flow, depth, body ids.",
-        "qsim render fan -o out/fan --frames 21 --height 128 --width 128\n"
-        "qsim render fan --explain", RESUMES,
+        sub,
+        "render",
+        _run_render,
+        "Render a scene into a clip: radiance, sharp frames, flow, depth, body ids.",
+        "qsim render fan -o out/fan --frames 21 --height 128 --width 128\nqsim render fan --explain",
+        RESUMES,
         threads="threads of the renderer (Dr.Jit); the picture does not depend on it",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "scene",
         help="a family of scenes/, a .py file with scene(seed, speed=...), an animated .glb, Mitsuba .xml, a folder",
@@ -117,7 +120,8 @@ def _run_render(args: argparse.Namespace) -> int:
     text += "" if found is None else f"\nerror: {found.line}"
     text += (missed := shortfall(found, args.psnr)) and f"\nerror: {missed}"
     if "fireflies_per_frame" in clip.meta:
-        fireflies, pixels = sum(clip.meta["fireflies_per_frame"]), math.prod(clip.shape)
+        fireflies = sum(clip.meta["fireflies_per_frame"])
+        pixels = math.prod(clip.shape)
         how = "before denoising" if render_meta["denoise"] else "not removed"
         text += f"\n{fireflies} of {pixels} pixels are fireflies (Monte-Carlo outliers); {how}"
     if cut := clip.meta["clipped_pixels"]:

@@ -15,13 +15,16 @@ from qsim.cli.options import checked, numbers
 def add_sense(sub: Any) -> None:
     """Add the command `sense` to a program."""
     parser = command(
-        sub, "sense", _run_sense, "Turn clips into few-bit streams, or draw one frame again and compare.",
+        sub,
+        "sense",
+        _run_sense,
+        "Turn clips into few-bit streams, or draw one frame again and compare.",
         "qsim sense out/fan --bits 3 --ppp 3.25\n"
         "qsim sense out/starter --sensor spad-320x240 --bits 1 --ppp 0.5,3.25,26\n"
         "qsim sense out/starter --name quiver-physical_3bit_3.25ppp --replay fan_0003:7",
         "the same command resumes with the missing streams",
         threads="threads of the compiled engine (Dr.Jit) that draws codes; codes do not depend on it",
-    )  # fmt: skip
+    )
     parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="clips or data sets")
     parser.add_argument(
         "--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default: quiver-physical)"
@@ -93,12 +96,25 @@ def _run_sense(args: argparse.Namespace) -> int:
         raise ValueError(f"--replay {args.replay}: is of one stream, not of {len(levels)} light levels; give one")
     rows = Rows.of(args.row_delay, args.row_order)
     wanted = [
-        Sensing(args.sensor or "quiver-physical", args.bits, seed=args.seed, name=args.name, group=args.group,
-                diffraction=args.diffraction, defects=args.defects, slices=args.slices, rows=rows,
-                colour=args.colour, exposures=args.exposures, follow=args.follow,
-                temperature=args.temperature, pixel_pitch=args.pixel_pitch, **level)
+        Sensing(
+            args.sensor or "quiver-physical",
+            args.bits,
+            seed=args.seed,
+            name=args.name,
+            group=args.group,
+            diffraction=args.diffraction,
+            defects=args.defects,
+            slices=args.slices,
+            rows=rows,
+            colour=args.colour,
+            exposures=args.exposures,
+            follow=args.follow,
+            temperature=args.temperature,
+            pixel_pitch=args.pixel_pitch,
+            **level,
+        )
         for level in levels
-    ]  # fmt: skip
+    ]
     clips = [clip for path in args.paths for clip in _clips(path)]
     if args.replay:
         return _replay(args, clips, wanted[0])

@@ -17,14 +17,18 @@ from qsim.time_forecast import TimeForecast
 def add_tradeoff(sub: Any) -> None:
     """Add the command `tradeoff` to a program."""
     parser = command(
-        sub, "tradeoff", _run_tradeoff, "Bit depth against motion, light, read noise and data rate.",
+        sub,
+        "tradeoff",
+        _run_tradeoff,
+        "Bit depth against motion, light, read noise and data rate.",
         "qsim tradeoff --table --size 240x320 --base-fps 10000 --read-noise 0.2 --bits 1,3,5,7,9\n"
         "qsim tradeoff out/fast --ppp 0.65 -o out/bits\n"
         "qsim tradeoff fan --px 3 --ppp 2 -o out/fan_3px\n"
         "qsim tradeoff fan --speed 0.5:8 --ppp 0.1:30 -o out/sweep\n"
-        "qsim tradeoff --paper-figure 1 -o out/figure1", RESUMES,
+        "qsim tradeoff --paper-figure 1 -o out/figure1",
+        RESUMES,
         threads="threads of the compiled engine (Dr.Jit)",
-    )  # fmt: skip
+    )
     parser.add_argument("source", nargs="?", help="a clip of at least 10000 fps, or a scene (rendered into -o)")
     parser.add_argument(
         "--table", action="store_true", help="print the table of bit depths only, computed without a clip"
@@ -116,7 +120,8 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     from qsim.studies.bit_depth.clip_study import study
     from qsim.studies.bit_depth.readout import StudySettings
 
-    bits, instants = tuple(args.bits or (1, 2, 3, 4, 5)), 8 if args.instants is None else args.instants
+    bits = tuple(args.bits or (1, 2, 3, 4, 5))
+    instants = 8 if args.instants is None else args.instants
     sensor = args.sensor or "quiver-physical"
     settings = StudySettings(
         bits, sensor, args.plane_sensor, None, 1, instants, args.seed, bool(args.px), args.temperature
@@ -157,7 +162,8 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
             drawing = TimeForecast(f"drawing {len(speeds) * len(ppps)} studies", note, unit="study")
             progress = _both(shown, drawing)
             found = speed_sweep.sweep(clips, ppps, settings, widen=widen, progress=progress)
-            result, pictures = found.to_dict(), {"best.png": figures.sweep_figure(found)}
+            result = found.to_dict()
+            pictures = {"best.png": figures.sweep_figure(found)}
             text += [line for row in found.studies for one in row for line in speed_sweep.table(one)]
             text.append(speed_sweep.summary(found))
             answers = found.answers
@@ -165,9 +171,11 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
             asked = replace(settings, ppp=levels[0], speed=clips[0].step)
             progress = _both(shown, TimeForecast("drawing the study", note, unit="frame"))
             one = widened(first, asked, note) if widen else study(first, asked, progress=progress)
-            result, pictures = speed_sweep.study_dict(one), {"tradeoff.png": figures.study_figure(one)}
+            result = speed_sweep.study_dict(one)
+            pictures = {"tradeoff.png": figures.study_figure(one)}
             text += speed_sweep.table(one)
-            settings, answers = replace(settings, bits=one.bits), [answer(one)]
+            settings = replace(settings, bits=one.bits)
+            answers = [answer(one)]
     if args.px:
         result["px_asked"], result["speeds_found"] = args.px, speeds
         text = [f"--px {px:g}: speed factor {speed:g}" for px, speed in zip(args.px, speeds, strict=True)] + text
@@ -222,7 +230,8 @@ def _speeds(args: argparse.Namespace, shape: Any) -> list[float]:
 def _motion(name: str, shape: Any, speed: float) -> float:
     from qsim.studies.bit_depth.answer import scene_motion
 
-    size, rate = (shape.height, shape.width), shape.frame_rate
+    size = (shape.height, shape.width)
+    rate = shape.frame_rate
     return scene_motion(name, size, frames=shape.frames, frame_rate=rate, seed=shape.seed, speed=speed)
 
 
@@ -240,13 +249,15 @@ def _paper_figure(args: argparse.Namespace) -> int:
     from qsim.studies.bit_depth import paper_figures
 
     height, width = args.size or (96, 128)
-    number, speeds = args.paper_figure, args.speed or [1.0]
+    number = args.paper_figure
+    speeds = args.speed or [1.0]
     if len(speeds) > 1:
         raise ValueError(f"--speed {args.speed}: --paper-figure draws one speed; give one")
     rate, frames = (paper_figures.RATE_1, 201) if number == 1 else (10_000.0, 511)
     shape = study_clips.ClipShape(frames, height, width, rate, seed=args.seed)
     names = [args.source] if args.source else ["fan"] if number == 1 else ["fan", "text"]
-    rows, result = [], []
+    rows = []
+    result = []
     for name, ppp in zip(names * (2 // len(names) if number == 2 else 1), (0.51, 0.40), strict=False):
         if (Path(name) / "clip.json").is_file():
             clip = Clip.open(name)
@@ -254,9 +265,11 @@ def _paper_figure(args: argparse.Namespace) -> int:
             with bar(name) as progress:
                 path = args.output / "clips" / Path(name).stem
                 clip = study_clips.render(name, path, shape, speed=speeds[0], progress=progress)
-        panels = paper_figures.figure_1(clip, seed=args.seed) if number == 1 else (
-            paper_figures.figure_2(clip, ppp, seed=args.seed)
-        )  # fmt: skip
+        panels = (
+            paper_figures.figure_1(clip, seed=args.seed)
+            if number == 1
+            else (paper_figures.figure_2(clip, ppp, seed=args.seed))
+        )
         rows.append(panels)
         result.append({"clip": clip.name, "panels": [{"label": p.label, **p.numbers} for p in panels]})
     found = {"figure": number, "rows": result}

@@ -11,7 +11,11 @@ from qsim.cli.console import bar, command, note, output, refuse_existing, refuse
 from qsim.cli.options import checked
 from qsim.figures import check_figure
 
-PIXELS, HEIGHT, WIDTH, PSNR = 1 << 22, 128, 256, 36.0  # defaults
+# defaults
+PIXELS = 1 << 22
+HEIGHT = 128
+WIDTH = 256
+PSNR = 36.0
 
 # Options that act, beside --seed, --json, --quiet and --verbose.
 ACTING = {
@@ -26,12 +30,15 @@ ACTING = {
 def add_validate(sub: Any) -> None:
     """Add the command `validate` to a program."""
     parser = command(
-        sub, "validate", _run_validate, "Measure speed and error of sensor engines, of the renderer or of reading.",
+        sub,
+        "validate",
+        _run_validate,
+        "Measure speed and error of sensor engines, of the renderer or of reading.",
         "qsim validate sensor --json -o out/sensor.png\nqsim validate render -o out/render.png\n"
         "qsim validate light --scenes glossy room --height 64 --width 96\n"
         "qsim validate engines --scenes fan glass\nqsim validate reading",
         threads="threads of the compiled engine (Dr.Jit)",
-    )  # fmt: skip
+    )
     parser.add_argument("what", choices=list(ACTING), help="what to validate")
     parser.add_argument("-o", "--output", type=Path, help="sensor, render: figure (.png, .svg or .pdf)")
     parser.add_argument("--pixels", type=int, help=f"sensor: pixels per draw (default {PIXELS})")
@@ -41,7 +48,8 @@ def add_validate(sub: Any) -> None:
         "render, engines, light: families or own scenes (default: four; light: all that were not used for tuning)"
     )
     parser.add_argument("--scenes", nargs="+", metavar="FAMILY", help=families)
-    whole, psnr = checked(checks.whole), checked(checks.psnr)
+    whole = checked(checks.whole)
+    psnr = checked(checks.psnr)
     parser.add_argument("--height", type=whole, help=f"render, engines, light: pixels (default {HEIGHT})")
     parser.add_argument("--width", type=whole, help=f"render, engines, light: pixels (default {WIDTH})")
     parser.add_argument("--psnr", type=psnr, help=f"light: required error, dB below white (default {PSNR:g})")

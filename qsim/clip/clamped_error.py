@@ -39,7 +39,8 @@ class Errors:
     @classmethod
     def of_halves(cls, halves: Array, white: float) -> Errors:
         """Return the errors of the mean of two independent halves [2, ...] that have noise only."""
-        picture, squares = halves.mean(axis=0), (halves[0] - halves[1]) ** 2 / 4
+        picture = halves.mean(axis=0)
+        squares = (halves[0] - halves[1]) ** 2 / 4
         clamped = clamped_squares(squares, picture, halves.min(axis=0), white)
         return cls(math.sqrt(float(clamped.mean())), math.sqrt(float(squares.mean())))
 
@@ -88,8 +89,10 @@ def over_neighbours(errors: Sequence[float], means: Sequence[float], shares: boo
     radiance (`means`) differs by more than NEAR, as under light that flickers, does not count. Where frames share
     samples (`shares`), the first and the last have those of one side only, and err more: they count for themselves.
     """
-    squares, lights = np.square(errors), np.asarray(means)
-    count, sums = np.ones_like(squares), squares.copy()
+    squares = np.square(errors)
+    lights = np.asarray(means)
+    count = np.ones_like(squares)
+    sums = squares.copy()
     for here, there in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
         near = np.abs(lights[here] - lights[there]) <= NEAR * lights[here]
         if shares:

@@ -108,8 +108,10 @@ class Clip(ClipFolder):
         `progress(done, total)` is called after each file; a stream counts as one.
         """
         problems = []
-        stored, streams = sorted(self.meta["checksums"].items()), sorted((self.path / "streams").glob("*.json"))
-        report, total = progress or (lambda done, total: None), len(stored) + len(streams)
+        stored = sorted(self.meta["checksums"].items())
+        streams = sorted((self.path / "streams").glob("*.json"))
+        report = progress or (lambda done, total: None)
+        total = len(stored) + len(streams)
         for done, (relative, expected) in enumerate(stored, 1):
             problems += files.differs(self.path / relative, expected)
             report(done, total)

@@ -61,7 +61,9 @@ def figure(pictures: Array, caption: str, fps: float = 12.0) -> str:
     from PIL import Image
 
     images = [Image.fromarray(picture) for picture in pictures]
-    kind, buffer = ("gif" if len(images) > 1 and pictures.ndim == 3 else "png"), io.BytesIO()  # a GIF has 256 colours
+    # a GIF has 256 colours
+    kind = "gif" if len(images) > 1 and pictures.ndim == 3 else "png"
+    buffer = io.BytesIO()
     animated = {"save_all": True, "append_images": images[1:], "duration": round(1000 / fps), "loop": 0}
     images[0].save(buffer, kind, **(animated if len(images) > 1 else {}))
     source = f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -40,7 +40,8 @@ class LazyArray(NDArrayOperatorsMixin):
             t = range(len(self))[first]  # an IndexError outside
             return self(t, t + 1)[0][tuple(rest)]
         if isinstance(first, slice) and (frames := range(len(self))[first]):
-            low, high = min(frames), max(frames)
+            low = min(frames)
+            high = max(frames)
             return self(low, high + 1)[(slice(frames[0] - low, None, frames.step), *rest)]
         return np.asarray(self)[index]
 

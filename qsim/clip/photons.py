@@ -110,7 +110,8 @@ def clip_photons(
         return radiance.astype(np.float64) * factor
     y, x = clip.origin
     if crop is not None:
-        y, x = y + crop[0], x + crop[1]
+        y = y + crop[0]
+        x = x + crop[1]
     if clip.bands is not None:
         if diffraction:
             cameras = [replace(camera, wavelength=wavelength) for wavelength in clip.bands]

@@ -79,7 +79,8 @@ class Rows:
     def check(self, height: int, width: int, frame_rate: float, planes: int, name: str) -> None:
         """Raise `ValueError` if a frame of `planes` clip frames is over before its lines are read."""
         lines = (height, width)[self.axis]
-        taken, period = lines * self.delay, planes / frame_rate
+        taken = lines * self.delay
+        period = planes / frame_rate
         if taken > period * (1 + 1e-9):
             raise ValueError(
                 f"{name}: {lines} {self.line}s of {self.delay:g} s take {taken:g} s, longer than a frame or plane of "
@@ -120,7 +121,8 @@ class Rows:
 
     def _place(self, part: Crop, crop: Crop) -> tuple[slice, slice]:
         """Return where a part of a crop lies in the image of the crop."""
-        y, x = part[0] - crop[0], part[1] - crop[1]
+        y = part[0] - crop[0]
+        x = part[1] - crop[1]
         return slice(y, y + part[2]), slice(x, x + part[3])
 
 

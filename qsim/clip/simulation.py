@@ -193,7 +193,8 @@ class Draw:
         share = gates.share_of(self.shares, t)
         part = np.full(self.planes, share) if self.sums else gates.weights(share, self.planes)
         light = self.light(clip, t * self.planes, (t + 1) * self.planes) * part[:, None, None]
-        key, exposure = self.key.at(self._number(t)), share * self._exposure(clip)
+        key = self.key.at(self._number(t))
+        exposure = share * self._exposure(clip)
         return self._summed(self._sampled(array, self._exposed(light), exposure, key))
 
     def _sampled(self, array: PixelArray | None, light: Array, exposure: float, key: Key) -> Array:
@@ -268,7 +269,8 @@ class Draw:
         array = self._array(clip)
         assert array is not None
         shape = (frames, *clip.shape[1:])
-        exposure, frame_time = self._exposure(clip), self.planes / clip.frame_rate
+        exposure = self._exposure(clip)
+        frame_time = self.planes / clip.frame_rate
 
         def rows_done(done: int, rows: int) -> None:
             if progress is not None:
@@ -289,7 +291,8 @@ class Draw:
                 f"{clip.name}: its codes were not drawn photon by photon; sense a CountingSPAD with --follow"
             )
         shape = (frames, *clip.shape[1:])
-        exposure, frame_time = self._exposure(clip), self.planes / clip.frame_rate
+        exposure = self._exposure(clip)
+        frame_time = self.planes / clip.frame_rate
         return event_simulation.trace(array, self._slices(clip), shape, exposure, frame_time, self.key, self.origin)
 
 
@@ -330,7 +333,8 @@ def same_settings(old: dict[str, Any], new: dict[str, Any]) -> bool:
     """Return whether two descriptions of streams have the same settings; folders of files do not count, nor do the
     stated effects of dead time: `drawn_by` tells what they led to.
     """
-    old, new = _without_folders(old), _without_folders(new)
+    old = _without_folders(old)
+    new = _without_folders(new)
     new.pop("dead_time_effects", None)
     same = all(old.get(key) == value for key, value in new.items())
     return same and all(old.get(key) == new.get(key) for key in OPTIONAL)
@@ -339,7 +343,8 @@ def same_settings(old: dict[str, Any], new: dict[str, Any]) -> bool:
 def _without_folders(meta: dict[str, Any]) -> dict[str, Any]:
     """Return a copy of a description: a sensor file has its name alone, measured maps have their checksums."""
     meta = dict(meta)
-    name, table = meta.get("sensor_name"), meta.get("defects")
+    name = meta.get("sensor_name")
+    table = meta.get("defects")
     if isinstance(name, str) and name.endswith(".toml"):
         meta = meta | {"sensor_name": Path(name).name}
     if isinstance(table, dict):

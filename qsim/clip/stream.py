@@ -54,7 +54,8 @@ class Stream:
         meta = files.read_json(json_path)
         files.check_version(json_path, meta.get("format_version"), FORMAT_VERSION)
         structure.description(json_path, meta, structure.STREAM, _DAMAGED)
-        bits, width = meta["sensor"].get("bits", meta["bits"]), meta["shape"][2]
+        bits = meta["sensor"].get("bits", meta["bits"])
+        width = meta["shape"][2]
         if (bits, width) != (meta["bits"], meta["width"]):
             raise ValueError(f"{json_path}: bits or width contradict the sensor or the shape; {_DAMAGED}")
         files.check_own(json_path, meta, _DAMAGED)
@@ -135,7 +136,8 @@ class Stream:
         if at not in ("row", "frame"):
             raise ValueError(f"{self.path}: truth at the time of each row or of the middle of the frame, got {at!r}")
         frames = self._existing(start, len(self) if stop is None else stop)
-        clip, factor = self.clip, self.photons_factor * self._planes
+        clip = self.clip
+        factor = self.photons_factor * self._planes
 
         def sharp(frame: int, crop: Crop | None = None) -> Array:
             return clip_photons(clip, frame, factor, crop, sharp=True)
@@ -244,7 +246,8 @@ class Stream:
         described = self.path.with_suffix(".json")
         problem = f"{described}: was replaced since it was opened; open the stream again"
         try:
-            status, now = described.stat(), files.read_json(described)
+            status = described.stat()
+            now = files.read_json(described)
         except FileNotFoundError:
             raise ValueError(problem) from None
         if now.get("sha256", now) != self.meta.get("sha256", self.meta):
@@ -274,7 +277,8 @@ class Stream:
         y, x, h, w = check_crop(crop, height, width, str(self.path))
         # The packed bytes that hold the columns: from the last code that starts on a byte.
         first = x - x % (8 // math.gcd(8, self.bits))
-        low, high = first * self.bits // 8, packing.packed_width(x + w, self.bits)
+        low = first * self.bits // 8
+        high = packing.packed_width(x + w, self.bits)
         part = np.asarray(self.packed[start:stop, y : y + h, low:high])
         return packing.unpack(part, self.bits, x + w - first)[..., x - first :]
 
@@ -314,8 +318,10 @@ def write_packed(path: Path, blocks: Iterable[Array], sensor: Sensor, meta: dict
     `meta` must hold shape (T, H, W), ppp_factor, exposure and frame_rate. `ValueError` if there are not T frames.
     """
     frames, height, width = meta["shape"]
-    row, json_path = packing.packed_width(width, sensor.bits), path.with_suffix(".json")
-    done, digest = 0, hashlib.sha256()
+    row = packing.packed_width(width, sensor.bits)
+    json_path = path.with_suffix(".json")
+    done = 0
+    digest = hashlib.sha256()
     with files.replacing_described(path, json_path) as (stored, described):
         head = _header(frames, height, row)
         stored.write(head)

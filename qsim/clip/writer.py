@@ -150,7 +150,8 @@ class ClipWriter:
             entry["fireflies"] = int(fireflies)
         if self._camera is not None:
             origin = tuple(self.meta.get("origin", (0, 0)))
-            bands, exposure = self.meta.get("bands"), self.meta["exposure"]
+            bands = self.meta.get("bands")
+            exposure = self.meta["exposure"]
             camera = self._camera.at(t / self.meta["frame_rate"])
             photons = (
                 radiometry.expected_photons(stored, camera, exposure, origin=origin)
@@ -284,7 +285,8 @@ class ClipWriter:
         meta["checksums"] = {name: digest for e in entries for name, digest in e["checksums"].items()}
         meta["software"] = _software()
         if all("error" in e for e in entries):
-            errors, errors_at = [e["error"] for e in entries], [e.get("errors_at", []) for e in entries]
+            errors = [e["error"] for e in entries]
+            errors_at = [e.get("errors_at", []) for e in entries]
             means = [e["mean_radiance"] for e in entries]
             shares = bool(self.meta.get("render", {}).get("neighbours"))
             meta |= clamped_error.measured(means, self._high(), errors, errors_at, shares)

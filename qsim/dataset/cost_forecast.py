@@ -183,7 +183,8 @@ def forecast(recipe: Recipe, *, frames: int = 5, progress: Progress | None = Non
 
     if frames < 2:
         raise ValueError(f"plan: got {frames} frames; at least 2 frames are needed, because the first one compiles")
-    kinds, costs = kinds_of(recipe), []
+    kinds = kinds_of(recipe)
+    costs = []
     with tempfile.TemporaryDirectory(prefix="qsim-plan-") as folder:
         for n, members in enumerate(kinds, 1):
             costs.append(measure_kind(members, Path(folder) / f"kind{n}", frames))
@@ -261,7 +262,8 @@ def evenly_spaced(members: list[Job]) -> list[Job]:
 
 def _budget(job: Job) -> tuple[Budget, Seconds]:
     """Return a job's budget, and the time that its choice took."""
-    scene, started = job_runner.load_scene(job), Seconds.now()
+    scene = job_runner.load_scene(job)
+    started = Seconds.now()
     return job_runner.choose_budget(job, scene), Seconds.now().since(started)
 
 
@@ -292,6 +294,7 @@ def sense_streams(job: Job, clip: Clip) -> tuple[Seconds, float]:
         started = Seconds.now()
         drawn, _ = sense(clip, sensing, force=True)
         spent = Seconds.now().since(started)
-        wall, processor = wall + spent.wall, processor + spent.processor
+        wall = wall + spent.wall
+        processor = processor + spent.processor
         size += drawn.path.stat().st_size
     return Seconds(wall / len(clip), processor / len(clip)), size / len(clip)

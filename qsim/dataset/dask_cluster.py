@@ -52,10 +52,18 @@ class Cluster:
         with client:
             # One future per job. pure=False: the result of a job is its files, not the value that is returned.
             futures = {
-                client.submit(run_job, job, folder, make, key=task_key(folder, job), pure=False,
-                              retries=RETRIES, resources=resources): job
+                client.submit(
+                    run_job,
+                    job,
+                    folder,
+                    make,
+                    key=task_key(folder, job),
+                    pure=False,
+                    retries=RETRIES,
+                    resources=resources,
+                ): job
                 for job in jobs
-            }  # fmt: skip
+            }
             try:
                 for future in distributed.as_completed(list(futures)):
                     yield _result(future, futures[future], folder)

@@ -180,7 +180,8 @@ def unproven(folder: Path, job: Job) -> str | None:
     The record must be that of this job, with the checksums of clip.json and of each stream's json. Every file that
     they name must exist, and the codes must have the size in their json. `verify_job` checks the contents.
     """
-    path, place = record_path(folder, job.name), folder / "clips" / job.name
+    path = record_path(folder, job.name)
+    place = folder / "clips" / job.name
     try:
         clip = Clip.open(place)
         if files.read_json(path) != make_record(job, place) or clip.meta.get("job") != job.digest:

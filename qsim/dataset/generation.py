@@ -117,7 +117,8 @@ def generate(
 
 def _unproven(folder: Path, jobs: list[Job], made: list[str]) -> dict[str, str]:
     """Return the jobs that a worker reports as done and that are not, with the reason; delete their records."""
-    by_name, failed = {job.name: job for job in jobs}, {}
+    by_name = {job.name: job for job in jobs}
+    failed = {}
     for name in made:
         if name not in by_name:
             failed[name] = f"{_REPORTED}no worker was given it"
@@ -158,7 +159,8 @@ def write_manifest(recipe: Recipe, folder: Path) -> None:
     lock.acquire(wait=True)
     with lock:
         scratch.sweep(folder)
-        jobs, failures = {}, _failures(folder, recipe.jobs)
+        jobs = {}
+        failures = _failures(folder, recipe.jobs)
         for job in recipe.jobs:
             entry: dict[str, Any] = {"split": job.split, "scene": job.scene, "digest": job.digest, "state": "missing"}
             if record_path(folder, job.name).is_file():

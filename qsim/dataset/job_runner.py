@@ -77,7 +77,8 @@ def load_traced(job: Job) -> tuple[Scene, dict[str, str]]:
     from qsim.dataset.scene_rendering import along_path, in_bands
 
     settings = job.settings
-    moved, size = settings.camera_path is not None, (settings.height, settings.width)
+    moved = settings.camera_path is not None
+    size = (settings.height, settings.width)
     scene, read = scene_files.load(job.family, job.scene_seed, job.speed, along_path=moved, bands=settings.bands)
     scene = along_path(scene, settings.camera_path, settings.frame_rate, size, job.speed)
     return in_bands(scene.resized(*size), settings.bands), read
@@ -102,7 +103,9 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
     from qsim.sensor.file_laws import Conditions
 
     settings = job.settings
-    electrons, of_code, ppp = 0.0, 0.0, None
+    electrons = 0.0
+    of_code = 0.0
+    ppp = None
     for sensing in job.streams:
         if sensing.ppp is not None:
             conditions = Conditions(sensing.temperature, scene.camera.wavelength)
@@ -113,10 +116,12 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
                 exposure=1 / settings.frame_rate,
                 conditions=conditions,
             )
-            share, of_frame = sensor.efficiency, sensing.ppp / sensing.planes
+            share = sensor.efficiency
+            of_frame = sensing.ppp / sensing.planes
             of_code = max(of_code, of_frame * share * sensing.planes)
             if of_frame * share > electrons:
-                electrons, ppp = of_frame * share, of_frame
+                electrons = of_frame * share
+                ppp = of_frame
     return fidelity.choose_budget(
         scene,
         frame_rate=settings.frame_rate,
@@ -177,7 +182,8 @@ def run_job(job: Job, folder: Path, make: RenderJob = render_job) -> Result:
 
 def _do(job: Job, folder: Path, make: RenderJob) -> Result:
     """Make clip, streams and record; each is complete before the next begins."""
-    started, worked = time.monotonic(), time.process_time()
+    started = time.monotonic()
+    worked = time.process_time()
     for path in (record_path(folder, job.name), failure_path(folder, job.name), folder / "clips" / job.name):
         scratch.sweep(path.parent)
     clip = _clip(job, folder, make)
@@ -210,7 +216,8 @@ def mark_failed(folder: Path, job: Job, message: str) -> None:
 
 def _clip(job: Job, folder: Path, make: RenderJob) -> Clip:
     """Return the job's finished clip, rendered if it does not exist."""
-    path, work = folder / "clips" / job.name, folder / "work" / job.name
+    path = folder / "clips" / job.name
+    work = folder / "work" / job.name
     if path.is_symlink() and not path.is_dir():
         raise ValueError(
             f"{path}: is a symbolic link to {os.readlink(path)}, which is not there; mount or move it back, or delete "

@@ -120,7 +120,8 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
         raise ValueError(f"{path}: the section [recipe] is missing")
     head = Section(written, "recipe", 0, document.table["recipe"])
     given = head.values(HEAD)
-    name, seed = given["name"], given.get("seed", 0)
+    name = given["name"]
+    seed = given.get("seed", 0)
     defaults = {"frame_rate": FRAME_RATE} | settings_of(head, given)
     streams: list[Sensing] = []
     taken: set[str] = set()

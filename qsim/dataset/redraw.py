@@ -71,7 +71,8 @@ def _redrawn(place: Path, json_path: Path, dataset: Path | None) -> Redrawn:
     path = json_path.with_suffix(".npy")
     try:
         stream = Stream.open(json_path)
-        draw, clip = dataclasses.replace(stored(stream), engine="reference"), Clip.open(place)
+        draw = dataclasses.replace(stored(stream), engine="reference")
+        clip = Clip.open(place)
         frames, height, width = stream.shape
         found = Redrawn(path, frames * height * width, cure=_cure(dataset))
         step = max(1, _BLOCK_PIXELS // (height * width * draw.planes))

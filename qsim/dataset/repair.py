@@ -50,7 +50,8 @@ def _damage(folder: Path, job: Job, entry: dict[str, Any]) -> _Damage:
     """Check the files of a finished job; `entry` is its entry in the manifest."""
     expected = entry | {"digest": job.digest, "split": job.split}
     problems = verify_job(folder, job.name, expected)
-    record, clip = record_path(folder, job.name), folder / "clips" / job.name
+    record = record_path(folder, job.name)
+    clip = folder / "clips" / job.name
     damaged = {Path(problem.split(": ")[0]) for problem in problems}
     if record in damaged:
         light = damaged == {record} and _vouched_for(job, clip, expected.get("record"))
@@ -61,8 +62,10 @@ def _damage(folder: Path, job: Job, entry: dict[str, Any]) -> _Damage:
 
 def _take_back(folder: Path, damage: _Damage) -> list[str]:
     """Delete the record and what is damaged; return the problems and the added streams that are lost."""
-    record, clip = record_path(folder, damage.job.name), folder / "clips" / damage.job.name
-    streams, wanted = clip / "streams", {sensing.stream_name for sensing in damage.job.streams}
+    record = record_path(folder, damage.job.name)
+    clip = folder / "clips" / damage.job.name
+    streams = clip / "streams"
+    wanted = {sensing.stream_name for sensing in damage.job.streams}
     record.unlink()
     lost = damage.paths if damage.light else set(streams.glob("*.json"))
     added = sorted({path.stem for path in lost if path.parent == streams} - wanted)

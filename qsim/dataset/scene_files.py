@@ -34,7 +34,9 @@ from qsim.scene import Scene
 _INSTALLED = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
 _LEFT_OUT = tuple(f"{os.path.realpath(folder)}{os.sep}" for folder in (*_INSTALLED, str(Path(__file__).parents[1])))
 _LIBRARY = Path(scenes.__file__).resolve().parent
-MOST_FOLDERS, MOST_FILES = 100, 10_000  # of one Mitsuba scene
+# of one Mitsuba scene
+MOST_FOLDERS = 100
+MOST_FILES = 10_000
 _PARTS_LEFT_OUT = frozenset({".cache", "site-packages", "dist-packages", "__pycache__"})
 
 

@@ -124,7 +124,8 @@ def load_scene(
 
 def _warn_of_another_view(scene: Scene, size: tuple[int, int]) -> None:
     """Warn where frames of another shape than a Mitsuba file's film see less, or more, to the sides."""
-    film, shown = scene.camera, scene.camera.resized(*size)
+    film = scene.camera
+    shown = scene.camera.resized(*size)
     before, after = (2 * math.degrees(math.atan(camera.width / 2 / camera.focal_pixels)) for camera in (film, shown))
     if abs(after - before) > 0.01 * before + math.degrees(1 / shown.focal_pixels):
         warnings.warn(

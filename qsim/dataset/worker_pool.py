@@ -21,7 +21,9 @@ from qsim.dataset.job_runner import RenderJob, Result, mark_failed, run_job
 from qsim.process import resident_memory
 
 MAX_CRASHES = 2  # of worker processes, before a job counts as failed
-MEMORY_EXIT, ORPHAN_EXIT = 70, 71  # exit codes of worker processes
+# exit codes of worker processes
+MEMORY_EXIT = 70
+ORPHAN_EXIT = 71
 
 
 @dataclass(frozen=True)

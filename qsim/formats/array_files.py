@@ -40,8 +40,20 @@ _LARGEST_CHUNK = 1 << 29  # bytes of a zarr chunk in memory; one of quanta-spad-
 _LARGEST_METADATA = 1 << 22  # bytes
 _ZARR_METADATA = ("zarr.json", ".zarray", ".zattrs", ".zgroup", ".zmetadata")
 # Of zarr; others execute what a file holds (pickle), or expand a few bytes without a limit (bz2, lzma).
-_CODECS = {"blosc", "bytes", "crc32c", "delta", "gzip", "lz4", "packbits", "sharding_indexed", "shuffle", "transpose",
-           "zlib", "zstd"}  # fmt: skip
+_CODECS = {
+    "blosc",
+    "bytes",
+    "crc32c",
+    "delta",
+    "gzip",
+    "lz4",
+    "packbits",
+    "sharding_indexed",
+    "shuffle",
+    "transpose",
+    "zlib",
+    "zstd",
+}
 
 
 def read_cube(path: Path, hints: Hints) -> Recording:
@@ -78,7 +90,8 @@ def written_with(path: Path, description: str) -> dict[str, Any] | None:
         found = files.read_json(path.with_name(description))
     except (OSError, ValueError):
         return None
-    software, shape = found.get("software"), found.get("shape")
+    software = found.get("software")
+    shape = found.get("shape")
     ours = isinstance(software, dict) and "qsim" in software and list_of(is_whole, 3)(shape)
     return found if ours else None
 
@@ -236,7 +249,8 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     shards = [path / "frames.npy"] if (path / "frames.npy").is_file() else numbered(list(path.glob("[0-9]*.npy")))
     if not shards:
         raise FileNotFoundError(f"{path}: holds neither frames.npy nor 0000.npy")
-    channel, first = hints.channel or 0, load_array(shards[0])
+    channel = hints.channel or 0
+    first = load_array(shards[0])
     channels = first.shape[3] if first.ndim == 4 else 1
     if channels > 1 and hints.channel is None:
         raise ValueError(f"{path}: {channels} colour planes; choose one with --channel 0")
@@ -263,8 +277,10 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     shape = check_shape(path, (int(ends[-1]), parts[0].shape[1], width))
 
     def read(start: int, stop: int) -> Array:
-        rows = [part[max(0, start - e + len(part)) : max(0, stop - e + len(part))]
-                for part, e in zip(parts, ends, strict=True)]  # fmt: skip
+        rows = [
+            part[max(0, start - e + len(part)) : max(0, stop - e + len(part))]
+            for part, e in zip(parts, ends, strict=True)
+        ]
         joined = np.concatenate(rows)
         if packed:
             return np.unpackbits(joined, axis=2, count=width)

@@ -30,7 +30,9 @@ from qsim.sensor import packing
 from qsim.sensor.colour_filter import MASKS
 from qsim.sensor.spad import BinarySPAD
 
-PLANES, SIDE = 1024, 800  # of a cube of the benchmark
+# of a cube of the benchmark
+PLANES = 1024
+SIDE = 800
 COLOURS = ("red", "green", "blue")
 DETECTIONS = 0.5  # expected per plane at white
 _TOGETHER = 64  # planes written at a time
@@ -159,11 +161,14 @@ def read_cube(path: Path) -> Cube:
             f"{path}: a cube of the challenge is uint8 [T, H, bytes, 3], found {packed.dtype} {list(packed.shape)}"
         )
     check_shape(path, packed.shape[:3])
-    row, side = packed.shape[2], path.with_name("meta.json")
+    row = packed.shape[2]
+    side = path.with_name("meta.json")
     width = files.read_json(side).get("width") if side.is_file() else 8 * row
     if type(width) is not int or packing.packed_width(width, 1) != row or width < 1:
-        raise ValueError(f"{side}: width {width!r:.40}, but {path.name} has {row} bytes per row; remove {side.name}, "
-                         f"or take it from a copy")  # fmt: skip
+        raise ValueError(
+            f"{side}: width {width!r:.40}, but {path.name} has {row} bytes per row; remove {side.name}, "
+            f"or take it from a copy"
+        )
     return Cube(path.absolute().parent.name, path, packed, width)
 
 

@@ -203,7 +203,8 @@ def _detect_raw(path: Path, many: bool = False) -> str:
         raise ValueError(
             f"{path}: {size} bytes fit none of {', '.join(candidates)}; the file is truncated, or another kind"
         )
-    evidence, found = [], []
+    evidence = []
+    found = []
     for name in fitting:
         sample = LAYOUTS[name](path, Hints()).read(0, min(64, size // raw_cameras.RAW_FRAME) or 1)
         found.append(raw_cameras.roughness(sample))

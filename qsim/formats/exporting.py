@@ -227,9 +227,31 @@ EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
 
 def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
     meta = source.meta
-    keys = ("shape", "frame_rate", "exposure", "radiance_unit", "scene", "split", "bits", "code_model", "sensor",
-            "seed", "ppp", "ppp_target", "lux_target", "ppp_factor", "width", "planes_per_code", "rows", "exposures",
-            "bands", "colour", "defects", "origin", "diffraction")  # fmt: skip
+    keys = (
+        "shape",
+        "frame_rate",
+        "exposure",
+        "radiance_unit",
+        "scene",
+        "split",
+        "bits",
+        "code_model",
+        "sensor",
+        "seed",
+        "ppp",
+        "ppp_target",
+        "lux_target",
+        "ppp_factor",
+        "width",
+        "planes_per_code",
+        "rows",
+        "exposures",
+        "bands",
+        "colour",
+        "defects",
+        "origin",
+        "diffraction",
+    )
     found = {key: meta[key] for key in keys if key in meta}
     found |= {"format_version": 1, "bit_order": "msb", "software": {"qsim": VERSION}}
     found["orientation"] = orientation(meta)

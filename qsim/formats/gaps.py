@@ -87,7 +87,8 @@ def told(path: Path, recording: Recording, keep: bool) -> Recording:
     if recording.times is None:
         return recording
     found = find(recording.times)
-    source, unit = recording.times.source, recording.times.unit
+    source = recording.times.source
+    unit = recording.times.unit
     if found.uneven is not None:
         small, large, t = found.uneven
         said = f"{path}: {source}: steps from {small:.4g} to {large:.4g} {unit}, the largest after frame {t}"
@@ -145,7 +146,8 @@ def _filled(recording: Recording, found: Gaps) -> Recording:
     assert inner is not None
 
     def marked(start: int, stop: int) -> tuple[Array, Array]:
-        light, mask = np.zeros((stop - start, height, width), np.float32), np.ones((stop - start, height, width), bool)
+        light = np.zeros((stop - start, height, width), np.float32)
+        mask = np.ones((stop - start, height, width), bool)
         first, last = (int(np.searchsorted(place, bound)) for bound in (start, stop))
         if first < last:
             at = place[first:last] - start

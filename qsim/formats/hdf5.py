@@ -31,7 +31,8 @@ def read_hdf5(path: Path, hints: Hints) -> Recording:
     with decoding_errors(path, "HDF5"), h5py.File(path, "r") as file:
         name = hints.dataset.strip("/") if hints.dataset is not None else _only(path, _datasets(file))
         stored = _dataset(path, file, name)
-        shape, dtype = tuple(stored.shape), stored.dtype
+        shape = tuple(stored.shape)
+        dtype = stored.dtype
         promised = math.prod(shape) * dtype.itemsize
         if promised > RATIO * path.stat().st_size:
             raise ValueError(f"{path}: {name} states {promised:.3g} bytes, which {path.stat().st_size} cannot hold")

@@ -149,7 +149,9 @@ def picture(path: Path, shape: tuple[int, int, int], raw: Any, first: Page, sour
     if first.orientation != 1:
         meta["orientation"] = f"upright: turned by its orientation tag {first.orientation}"
         reading = f"turned upright by its orientation tag {first.orientation}"
-    one_bit, colour, full = first.depth == 1, first.pixels.ndim == 3, 2**first.depth - 1
+    one_bit = first.depth == 1
+    colour = first.pixels.ndim == 3
+    full = 2**first.depth - 1
     few = 1 < first.depth < 8 and not colour
     codes = one_bit or hints.bits is not None or (few and hints.transfer is None and hints.white is None)
     if codes:  # of one bit, --bits and --stretched have no effect
@@ -220,7 +222,9 @@ def _png(path: Path, codes: bool) -> Page:
         check_shape(path, (1, opened.height, opened.width))
         with open(path, "rb") as file:
             header = file.read(26)
-        depth, kind = header[24], header[25]  # IHDR: bits per sample; 0 grey, 2 RGB, 3 palette, 4 and 6 with alpha
+        # IHDR: bits per sample; 0 grey, 2 RGB, 3 palette, 4 and 6 with alpha
+        depth = header[24]
+        kind = header[25]
         if depth == 16 and kind != 0:  # the library keeps the upper 8 bits
             raise ValueError(f"{path}: colour of 16 bits per channel would lose 8; store it as TIFF, or with 8 bits")
         tag = int(opened.getexif().get(ORIENTATION_TAG, 1))
@@ -228,7 +232,8 @@ def _png(path: Path, codes: bool) -> Page:
         if kind == 3 and codes:
             pixels = _palette_codes(path, opened, depth)
         elif kind != 0:
-            pixels, depth = np.asarray(opened.convert("RGB")), 8
+            pixels = np.asarray(opened.convert("RGB"))
+            depth = 8
         else:
             pixels = np.asarray(opened)
             if depth == 16:
@@ -266,7 +271,8 @@ def _tiff(path: Path, page: int, hints: Hints) -> Page:
     with decoding_errors(path, "TIFF"), tifffile.TiffFile(path) as opened:
         found: Any = opened.pages[page]
         check_shape(path, (1, found.imagelength, found.imagewidth))
-        kind, packed = found.photometric, found.compression
+        kind = found.photometric
+        packed = found.compression
         codes = kind == tifffile.PHOTOMETRIC.PALETTE and hints.bits is not None  # stacks of ImageJ have a colour table
         if not (kind in _GREY_OR_RGB or codes or (kind == tifffile.PHOTOMETRIC.YCBCR and packed in _JPEG)):
             raise ValueError(f"{path}: page {page} holds {getattr(kind, 'name', kind)} pixels; save it as grey or RGB")

@@ -175,7 +175,8 @@ def saturation_line(clip: Clip) -> str:
     """Return a line about the saturation of an imported clip: its white and the share of saturated pixels."""
     known = clip.meta.get("saturation") or {"white": None, "assumed": True}
     missing = len((clip.meta.get("source") or {}).get("missing_frames", ()))
-    white, count = known["white"], int(clip.meta.get("saturated_pixels") or 0) - missing * math.prod(clip.shape[1:])
+    white = known["white"]
+    count = int(clip.meta.get("saturated_pixels") or 0) - missing * math.prod(clip.shape[1:])
     share = f"{100 * count / math.prod(clip.shape):.3g} % of pixels"
     scale = (clip.meta.get("source") or {}).get("scale")
     cut = "" if scale is None else f"; the light of the file is scaled by {scale:g}"
@@ -259,7 +260,8 @@ def _times_of(recording: Recording) -> dict[str, Any]:
 
 def _as_stated(path: Path, recording: Recording, capture: Import) -> Import:
     """Return the capture with the exposure that the recording states; `ValueError` for rates that contradict it."""
-    rate, exposure = recording.frame_rate, recording.exposure
+    rate = recording.frame_rate
+    exposure = recording.exposure
     if rate is None or exposure is None:
         return capture
     given = (("frame-rate", capture.frame_rate, rate), ("exposure", capture.exposure or exposure, exposure))
@@ -295,7 +297,8 @@ def _tables(capture: Import, sensor: Sensor, height: int, width: int) -> tuple[S
     """Return the sensor with the dark rate of its measured map, and the other tables of its file, for a description."""
     if capture.sensor is None or not capture.sensor.endswith(".toml"):
         return sensor, {}
-    defects, filters = defect_table.from_toml(capture.sensor), colour_filter.from_toml(capture.sensor)
+    defects = defect_table.from_toml(capture.sensor)
+    filters = colour_filter.from_toml(capture.sensor)
     found: dict[str, Any] = {} if filters is None else {"colour": filters.to_dict()}
     if defects is None:
         return sensor, found

@@ -123,6 +123,7 @@ def _frames_first(path: Path, name: str, planes: Array) -> Array:
 
 def _plausible(path: Path, shape: tuple[int, ...]) -> None:
     """Raise `ValueError` if a header states more values than deflate (at most 1032-fold) can hold in the file."""
-    promised, size = float(np.prod(shape, dtype=float)), path.stat().st_size
+    promised = float(np.prod(shape, dtype=float))
+    size = path.stat().st_size
     if promised > 1032.0 * size:
         raise ValueError(f"{path}: the header states {promised:.3g} values, which {size} bytes cannot hold")

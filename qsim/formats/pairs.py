@@ -113,7 +113,8 @@ def write(
     groups = windows(splits, frames)
     _check_target(path, force)
     path.parent.mkdir(parents=True, exist_ok=True)
-    total, done = sum(map(len, groups.values())), 0
+    total = sum(map(len, groups.values()))
+    done = 0
     with replacing(path) as part, h5py.File(part.name, "w") as file:  # by name: HDF5 also reads what it wrote
         file.attrs.update({"format": "qsim-pairs-1", "software": f"qsim {VERSION}", "truth": "photons"})
         for split, listed in groups.items():

@@ -140,7 +140,8 @@ def read(path: Path) -> PhotonTimes:
         if not list_of(is_whole, 3)(meta["shape"]):
             raise ValueError(f"{path}: a shape of {meta['shape']!r:.40}; it is three whole numbers")
         shape = check_shape(path, tuple(meta["shape"]))
-        exposure, rate = meta["exposure"], meta["frame_rate"]
+        exposure = meta["exposure"]
+        rate = meta["frame_rate"]
         if not (is_positive(exposure) and is_positive(rate) and exposure * rate < 1 + 1e-9):
             raise ValueError(f"{path}: an exposure of {exposure!r:.40} s at {rate!r:.40} frames per second")
         rows = from_dict(meta["rows"], f"{path}: rows") if "rows" in meta else None
@@ -152,15 +153,18 @@ def read(path: Path) -> PhotonTimes:
 
 def read_photons(path: Path, hints: Hints) -> Recording:
     """Read photon times as the codes of a clocked SPAD that saw the same photons: 2^bits - 1 planes per exposure."""
-    photons, bits = read(path), hints.bits or 1
+    photons = read(path)
+    bits = hints.bits or 1
     if not 1 <= bits <= 8:
         raise ValueError(f"{path}: sums of planes of {bits} bits; 1 to 8 are made of photon times")
     planes = 2**bits - 1
     fired = photons.clocked(planes).reshape(-1, planes, *photons.shape[1:])
     codes = fired.sum(axis=1, dtype=np.uint8)
-    rate, exposure = photons.frame_rate, photons.exposure
+    rate = photons.frame_rate
+    exposure = photons.exposure
     meta = {} if photons.rows is None else {"rows": photons.rows.to_dict()}
-    shape, name = photons.shape, "photon times"
+    shape = photons.shape
+    name = "photon times"
     return Recording(shape, lambda a, b: codes[a:b], name, bits, meta=meta, frame_rate=rate, exposure=exposure)
 
 
@@ -187,7 +191,8 @@ def _arrays(path: Path) -> dict[str, Array]:
 def _check(path: Path, photons: PhotonTimes) -> None:
     """Raise `ValueError` unless the events belong to the pixels and exposures that the file states."""
     frames, height, width = photons.shape
-    first, times = photons.first, photons.times
+    first = photons.first
+    times = photons.times
     sizes = len(first) == height * width + 1 and len(times) == len(photons.kind)
     if not sizes or first[0] != 0 or first[-1] != len(times) or (np.diff(first) < 0).any():
         raise ValueError(f"{path}: {len(times)} events do not fit {height} x {width} pixels")

@@ -19,7 +19,9 @@ from qsim.checks import check_shape
 from qsim.formats.raw_layout import raw_files
 from qsim.formats.recording import Hints, Recording, check_size
 
-HALF, FULL = (256, 512), (512, 512)  # pixels of SwissSPAD2's half and full array
+# pixels of SwissSPAD2's half and full array
+HALF = (256, 512)
+FULL = (512, 512)
 RAW_FRAME = 512 * 512 // 8  # bytes of one full-array plane
 
 
@@ -72,15 +74,18 @@ def read_spad512s(path: Path, _hints: Hints) -> Recording:
 
 def read_spike(path: Path, hints: Hints) -> Recording:
     """Spike camera: one bit stream, least significant bit first, frames upside down; size by hints or config.yaml."""
-    height, width = hints.height, hints.width
-    config, ours = path.parent / "config.yaml", path.with_name(f"{path.name}.json")
+    height = hints.height
+    width = hints.width
+    config = path.parent / "config.yaml"
+    ours = path.with_name(f"{path.name}.json")
     if height is None and width is None and ours.is_file():  # written by `write_spike`
         shape = files.read_json(ours).get("shape")
         if isinstance(shape, list) and len(shape) == 3 and all(type(n) is int for n in shape):
             _, height, width = shape
     if height is None and width is None and config.is_file():
         found = dict(re.findall(r"^\s*(spike_h|spike_w)\s*:\s*(\d{1,9})\b", config.read_text("utf-8", "replace"), re.M))
-        height, width = int(found.get("spike_h", 0)) or None, int(found.get("spike_w", 0)) or None
+        height = int(found.get("spike_h", 0)) or None
+        width = int(found.get("spike_w", 0)) or None
     if height is None or width is None:
         raise ValueError(f"{path}: a spike file does not hold its size; add --height and --width, as in 250 and 400")
     check_shape(path, (1, height, width))
@@ -123,7 +128,8 @@ def _raw(
     def read(start: int, stop: int) -> Array:
         parts = []
         for file, count, end in zip(files, counts, ends, strict=True):
-            low, high = max(start - (end - count), 0), min(stop - (end - count), count)
+            low = max(start - (end - count), 0)
+            high = min(stop - (end - count), count)
             if low < high:
                 raw = np.fromfile(file, np.uint8, (high - low) * frame_bytes, offset=low * frame_bytes)
                 parts.append(decode(raw))

@@ -26,7 +26,8 @@ from qsim.formats import gaps
 from qsim.formats.recording import Hints, Recording, check_size, values_recording
 
 LARGEST_SIDE_FILE = 1 << 20  # bytes of a .cihx
-ORDERS, ENDIANS = ("msb", "lsb"), ("little", "big")
+ORDERS = ("msb", "lsb")
+ENDIANS = ("little", "big")
 
 
 @dataclass(frozen=True)
@@ -174,12 +175,15 @@ def read_mraw(path: Path, hints: Hints) -> Recording:
         raise ValueError(
             f"{beside}: holds {facts['type']} frames as {facts['format']}; read are monochrome frames as MRaw"
         )
-    stored, depth, side = _whole(beside, "bit", facts), _whole(beside, "depth", facts), facts["side"].lower()
+    stored = _whole(beside, "bit", facts)
+    depth = _whole(beside, "depth", facts)
+    side = facts["side"].lower()
     if not (stored in (8, 12, 16) and 1 <= depth <= stored and side in ("lower", "higher")):
         raise ValueError(
             f"{beside}: {depth} bits ({facts['side']}) in pixels of {stored}; read are 8, 12 and 16, Lower or Higher"
         )
-    height, width = _whole(beside, "height", facts), _whole(beside, "width", facts)
+    height = _whole(beside, "height", facts)
+    width = _whole(beside, "width", facts)
     shift = stored - depth if side == "higher" and stored != 12 else 0
     layout = Layout(height, width, depth, "msb" if stored == 12 else None, shift=shift)
     if stored == 12:
@@ -190,7 +194,8 @@ def read_mraw(path: Path, hints: Hints) -> Recording:
     stated = _whole(beside, "frames", facts)
     if recording.shape[0] != stated:
         raise ValueError(f"{path}: {recording.shape[0]} frames, and {beside.name} states {stated}; copy it again")
-    rate, shutter = _number(beside, "rate", facts), _number(beside, "shutter", facts)
+    rate = _number(beside, "rate", facts)
+    shutter = _number(beside, "shutter", facts)
     exposure = shutter if shutter < 1 else 1 / shutter  # stated as seconds, or as the n of 1/n s
     meta = {"camera": facts["camera"], "exposure_stated": exposure}
     said = f"{recording.reading}; {rate:g} frames per second, exposure {exposure:g} s (shutter {facts['shutter']})"

@@ -56,7 +56,8 @@ class Recording:
 
     def __post_init__(self) -> None:
         """Make every reader's arrays plain, whatever memory its library returns (arrays.py)."""
-        read, marked = self.read, self.marked
+        read = self.read
+        marked = self.marked
         object.__setattr__(self, "read", lambda start, stop: plain(read(start, stop)))
         if marked is not None:
             object.__setattr__(self, "marked", lambda start, stop: tuple(plain(part) for part in marked(start, stop)))

@@ -36,7 +36,8 @@ def read_ptu(path: Path, hints: Hints) -> Recording:
         counts = np.asarray(file.decode_image(dtime=-1, dtype=np.uint32, keepdims=True))
         counts = counts.sum(axis=file.dims.index("H")) if "H" in file.dims else counts
         axes = "".join(letter for letter in file.dims if letter != "H")
-        frame_time, pixel_time = float(file.frame_time), float(file.pixel_time)
+        frame_time = float(file.frame_time)
+        pixel_time = float(file.pixel_time)
     found = _counts(path, counts, axes, "PTU", hints)
     if not (0 < pixel_time <= frame_time < math.inf):
         return found

@@ -46,7 +46,8 @@ def frames_of(path: Path, hints: Hints) -> Stack:
                     "do; save it with a page for each frame, or as a folder of TIFFs"
                 )
         before, stated = _axes(opened, count)
-        rows, columns = opened.pages.first.imagelength, opened.pages.first.imagewidth
+        rows = opened.pages.first.imagelength
+        columns = opened.pages.first.imagewidth
     if (hints.axes is None and len(before) < 2 and stated[:1] not in ("C", "S")) or count == 1:
         return Stack(tuple(range(count)), "")
     size = (*before, rows, columns)
@@ -61,7 +62,8 @@ def _axes(opened: Any, count: int) -> tuple[tuple[int, ...], str]:
     if len(opened.series) == 1:
         series = opened.series[0]
         inside = len(opened.pages.first.shape)
-        before, names = tuple(int(n) for n in series.shape[:-inside]), series.axes[:-inside]
+        before = tuple(int(n) for n in series.shape[:-inside])
+        names = series.axes[:-inside]
         if math.prod(before) == count and before:
             return before, names
     return (count,), "I"

@@ -222,7 +222,8 @@ def _video_facts(path: Path) -> Facts:
         if not container.streams.video:
             raise ValueError(f"{path}: has no video stream")
         stream = container.streams.video[0]
-        height, width = stream.codec_context.height, stream.codec_context.width
+        height = stream.codec_context.height
+        width = stream.codec_context.width
         full = _full(path, stream.codec_context.format)
         packets = [packet for packet in container.demux(stream) if packet.size and not packet.is_discard]
         stamps = sorted(packet.pts for packet in packets if packet.pts is not None)

@@ -57,8 +57,10 @@ class Path2D:
         """Return the map [3, 3] of homogeneous (y, x, 1) from layer to picture at a time."""
         wave = np.sin(self.frequency * time + self.phase) - np.sin(self.phase)
         y, x = (p + v * time + a * wave for p, v, a in zip(self.place, self.speed, self.sway, strict=True))
-        turn, zoom = self.angle + self.spin * time, np.exp(self.growth * time)
-        c, s = zoom * np.cos(turn), zoom * np.sin(turn)
+        turn = self.angle + self.spin * time
+        zoom = np.exp(self.growth * time)
+        c = zoom * np.cos(turn)
+        s = zoom * np.sin(turn)
         return np.array([[c, -s, y], [s, c, x], [0, 0, 1]])
 
 
@@ -107,7 +109,8 @@ def frame(parts: Sequence[Layer], size: tuple[int, int], time: float) -> tuple[A
         for dx in steps:
             total += _seen(parts, np.stack([y.ravel() + dy, x.ravel() + dx]), time)[0].reshape(size)
     points = np.stack([y.ravel(), x.ravel()])
-    top, moved = _seen(parts, points, time)[1], points.copy()
+    top = _seen(parts, points, time)[1]
+    moved = points.copy()
     for i, layer in enumerate(parts):
         step = layer.path.matrix(time + 1) @ np.linalg.inv(layer.path.matrix(time))
         own = top == i
@@ -120,7 +123,8 @@ def frame(parts: Sequence[Layer], size: tuple[int, int], time: float) -> tuple[A
 
 def _seen(parts: Sequence[Layer], points: Array, time: float) -> tuple[Array, Array]:
     """Return the light and the uppermost layer that covers more than half, at points (y, x) [2, n]."""
-    light, top = np.zeros(points.shape[1]), np.zeros(points.shape[1], int)
+    light = np.zeros(points.shape[1])
+    top = np.zeros(points.shape[1], int)
     for i, layer in enumerate(parts):
         own, cover = layer.sampled(points, time)
         light += cover * (own - light)
@@ -131,8 +135,10 @@ def _seen(parts: Sequence[Layer], points: Array, time: float) -> tuple[Array, Ar
 def _path(size: tuple[int, int], largest: float, radius: float, rng: np.random.Generator) -> Path2D:
     """Return a random motion of at most about `largest` px/frame for points up to `radius` px from its centre."""
     shares = rng.dirichlet((3.0, 1.0, 0.7, 0.7)) * largest  # of translation, sway, rotation and zoom
-    angle, frequency = rng.uniform(0, 2 * np.pi), rng.uniform(0.2, 0.6)
-    side, sway = rng.uniform(0, 2 * np.pi), shares[1] / frequency
+    angle = rng.uniform(0, 2 * np.pi)
+    frequency = rng.uniform(0.2, 0.6)
+    side = rng.uniform(0, 2 * np.pi)
+    sway = shares[1] / frequency
     return Path2D(
         place=(float(rng.uniform(0, size[0])), float(rng.uniform(0, size[1]))),
         speed=(float(shares[0] * np.sin(angle)), float(shares[0] * np.cos(angle))),
@@ -270,7 +276,8 @@ def _check_same(path: Path, meta: dict[str, Any]) -> None:
 
 def _copy_licence(licence: Path, folder: Path) -> None:
     """Copy a licence as LICENCE.txt; another one that is there stays, and this one is named by its checksum."""
-    text, copy = licence.read_bytes(), folder / "LICENCE.txt"
+    text = licence.read_bytes()
+    copy = folder / "LICENCE.txt"
     if copy.is_file() and copy.read_bytes() != text:
         copy = folder / f"LICENCE-{files.sha256(text)[:8]}.txt"
     files.write_bytes(copy, text)

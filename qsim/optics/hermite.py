@@ -24,9 +24,12 @@ def slopes(times: Sequence[float], values: Array) -> Array:
 def value_at(times: Sequence[float], values: Array, t: float) -> Array:
     """Return the values [N] at time t of curves through `values` [times, N]; they rest outside of the times."""
     i, s, length = interval(times, t)
-    p, m = values, slopes(times, values) * length
+    p = values
+    m = slopes(times, values) * length
     value: Array = (
-        (2 * s**3 - 3 * s**2 + 1) * p[i] + (s**3 - 2 * s**2 + s) * m[i]
-        + (3 * s**2 - 2 * s**3) * p[i + 1] + (s**3 - s**2) * m[i + 1]
-    )  # fmt: skip
+        (2 * s**3 - 3 * s**2 + 1) * p[i]
+        + (s**3 - 2 * s**2 + s) * m[i]
+        + (3 * s**2 - 2 * s**3) * p[i + 1]
+        + (s**3 - s**2) * m[i + 1]
+    )
     return value

@@ -123,7 +123,8 @@ class Lens:
 
         Without tangential terms, all that are seen with this length are as long.
         """
-        far, fold = float(seen.max(initial=0.0)), self.fold
+        far = float(seen.max(initial=0.0))
+        fold = self.fold
         reach = min(far, fold)
         while reach < fold and reach * float(self._least_stretch(np.array(reach))) < far:
             reach = min(1.5 * reach, fold)
@@ -215,7 +216,8 @@ class Lens:
 
     def _derivative(self, slopes: Array) -> tuple[Array, Array, Array]:
         """Return d x seen / d x, d x seen / d y (which is d y seen / d x) and d y seen / d y, [...] each."""
-        x, y = slopes[..., 0], slopes[..., 1]
+        x = slopes[..., 0]
+        y = slopes[..., 1]
         square = x * x + y * y
         stretch = self._stretch(np.sqrt(square))
         slope = self.k1 + square * (2 * self.k2 + square * (3 * self.k3 + square * 4 * self.k4))  # d stretch / d r^2

@@ -117,7 +117,8 @@ def light_windows(instants: Sequence[float], exposure: float) -> list[tuple[floa
     compares motion only. A flash shorter than a part is spread over it, which no error counts (`fidelity.flickering`).
     """
     each = 3 if len(instants) % 3 == 0 else 1
-    start, count = (instants[0] + instants[-1] - exposure) / 2, len(instants) // each
+    start = (instants[0] + instants[-1] - exposure) / 2
+    count = len(instants) // each
     return [
         (start + exposure * (i // each) / count, start + exposure * (i // each + 1) / count)
         for i in range(len(instants))

@@ -92,7 +92,8 @@ class CameraRays:
         """Return rays through film positions [px]; the pose is data, not code, so that motion compiles no kernel."""
         import drjit as dr
 
-        mi, camera = self._mi, self._camera
+        mi = self._mi
+        camera = self._camera
         axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in pose[:3, i])) for i in range(4)]
         numbers = (camera.focal_pixels * camera.aspect, camera.focal_pixels, *camera.axis, camera.pupil_radius)
         f_x, f_y, x, y, pupil = (dr.opaque(mi.Float, n) for n in numbers) if self._changes else numbers
@@ -131,7 +132,8 @@ class _Bends:
         seen = dr.sqrt(across * across + down * down)
         place = seen / self._step
         left = dr.minimum(self._mi.UInt32(place), KNOWN - 2)
-        start, end = dr.gather(self._mi.Float, self._stretch, left), dr.gather(self._mi.Float, self._stretch, left + 1)
+        start = dr.gather(self._mi.Float, self._stretch, left)
+        end = dr.gather(self._mi.Float, self._stretch, left + 1)
         stretch = start + (end - start) * (place - self._mi.Float(left))
         square = dr.square(seen * stretch)
         # The stretch s of the slope seen: s (1 + k1 (s seen)^2 + k2 (s seen)^4 + ...) = 1
@@ -152,7 +154,8 @@ class _Warp:
         places = np.stack(np.meshgrid((columns - x) / f, (lines - y) / f), axis=-1)
         known = lens.traced(places).astype(np.float32)
         self._across, self._down = (mi.Float(np.ascontiguousarray(known[..., i]).ravel()) for i in range(2))
-        first, step = places[0, 0] / (lens.aspect, 1), (places[1, 1] - places[0, 0]) / (lens.aspect, 1)
+        first = places[0, 0] / (lens.aspect, 1)
+        step = (places[1, 1] - places[0, 0]) / (lens.aspect, 1)
         self._first, self._step = ([dr.opaque(mi.Float, float(n)) for n in pair] for pair in (first, step))
         self._terms = _radial_terms(mi, lens)
         self._p1, self._p2 = (dr.opaque(mi.Float, float(term)) for term in (lens.p1, lens.p2))
@@ -183,9 +186,11 @@ class _Warp:
         import drjit as dr
 
         mi = self._mi
-        at_x, at_y = (across - self._first[0]) / self._step[0], (down - self._first[1]) / self._step[1]
+        at_x = (across - self._first[0]) / self._step[0]
+        at_y = (down - self._first[1]) / self._step[1]
         column, line = (dr.minimum(mi.UInt32(dr.maximum(at, 0)), GRID - 2) for at in (at_x, at_y))
-        right, below = at_x - mi.Float(column), at_y - mi.Float(line)
+        right = at_x - mi.Float(column)
+        below = at_y - mi.Float(line)
         found = []
         for known in (self._across, self._down):
             corner = [dr.gather(mi.Float, known, line * GRID + column + more) for more in (0, 1, GRID, GRID + 1)]

@@ -53,7 +53,8 @@ def denoised(noisy: Array, albedo: Array, normal: Array, quality: str = "high") 
         raise ValueError("denoising requires Open Image Denoise, which is missing: pip install pyoidn")
     import pyoidn
 
-    colour, matt = _three(noisy), _three(np.clip(albedo, 0, 1))
+    colour = _three(noisy)
+    matt = _three(np.clip(albedo, 0, 1))
     normal = normal.astype(np.float32)
     cleaned = pyoidn.denoise(colour, albedo=matt, normal=normal, hdr=True, clean_aux=True, quality=quality)
     return np.maximum(cleaned[..., 0] if noisy.ndim == 2 else np.moveaxis(cleaned, -1, 0), 0)
@@ -110,7 +111,8 @@ def cleaned_mean(halves: Array, albedo: Array, normal: Array, white: float, qual
 
 def keeping_mean(mixed: Kind, wanted: float, white: float) -> Kind:
     """Return a mixture with this mean radiance, or as near to it as KEPT times its error at white allows."""
-    mean, most = float(mixed.picture.mean()), KEPT * mixed.error_at(white)
+    mean = float(mixed.picture.mean())
+    most = KEPT * mixed.error_at(white)
     if not mean > 0:
         return mixed
     factor = 1 + float(np.clip(wanted - mean, -most, most)) / mean
@@ -126,8 +128,10 @@ def mixture(halves: Array, cleaned: Array) -> Mixture:
     """
     from scipy.ndimage import uniform_filter
 
-    z, y = halves[0] - halves[1], cleaned[0] - cleaned[1]
-    gain, apart = z * (z - y) / 4, (cleaned.mean(axis=0) - halves.mean(axis=0)) ** 2
+    z = halves[0] - halves[1]
+    y = cleaned[0] - cleaned[1]
+    gain = z * (z - y) / 4
+    apart = (cleaned.mean(axis=0) - halves.mean(axis=0)) ** 2
     share = np.clip(
         uniform_filter(gain, AROUND, axes=(-2, -1)) / np.maximum(uniform_filter(apart, AROUND, axes=(-2, -1)), 1e-300),
         0,

@@ -113,12 +113,15 @@ def choose_budget(
     exposed = pilot.exposures(PEAK_INSTANTS, DEEPEST) if blurs else full
     rough, _ = allowed_in(exposed, psnr, ppp, quantum_efficiency, planes)
     bounces, cut, about_bounces = fewest_bounces(lambda depth: pilot.mean(COUNTS[1], depth), full, rough.repeated)
-    left_out, dimmed = Errors.between(cut, full, rough.white), dimming(full, cut)
+    left_out = Errors.between(cut, full, rough.white)
+    dimmed = dimming(full, cut)
     halves = [pilot.halves(count, bounces) for count in COUNTS]
     bright = halves[-1].mean(axis=0)
     allowed, limit = allowed_in(exposed if blurs else bright, psnr, ppp, quantum_efficiency, planes)
     why = "nothing moves" if shutter else "the shutter is 0"
-    instants, blurred, about_blur = 1, 0.0, Finding("motion blur", "none, one instant", why)
+    instants = 1
+    blurred = 0.0
+    about_blur = Finding("motion blur", "none, one instant", why)
     if blurs:
         low, high = (float(np.percentile(bright, share)) for share in (0.1, 99.9))
         contrast = allowed.fraction(Errors(min(high, allowed.white) - low, high - low))
@@ -129,7 +132,8 @@ def choose_budget(
     share = math.sqrt(1 - min(strict.fraction(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
     noise = Noise.of(halves, allowed.white).times(pilot.unevenness(instants))
     samples, about_samples = fewest_samples(noise, instants, allowed, share)
-    fewer, about_denoiser = None, Finding("denoiser", "off", "not requested")
+    fewer = None
+    about_denoiser = Finding("denoiser", "off", "not requested")
     if denoise is not False:
         fewer, about_denoiser = denoised_samples(
             pilot, instants, bounces, strict, share, samples, denoise, lambda n: noise.at(n / instants, instants)
@@ -148,7 +152,8 @@ def choose_budget(
     lens = (*effects, *effects_left_out(scene.camera, pilot.truths(), scene.bands))
     pixels = scene.camera.height * scene.camera.width
     noisy = noise.at(chosen.samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
-    about_light, about_motion = _light(dimmed, noisy, bool(chosen.denoise)), moving(pilot.extent, shutter)
+    about_light = _light(dimmed, noisy, bool(chosen.denoise))
+    about_motion = moving(pilot.extent, shutter)
     shared = (limit, about_samples, about_denoiser, about_reuse)
     findings = (*shared, about_bounces, about_light, about_motion, about_blur, *lens)
     work = (chosen.samples, bounces, instants, instants > 1, bool(chosen.denoise))
@@ -168,7 +173,8 @@ def allowed_in(
     image: Array, psnr: float, ppp: float | None, efficiency: float, planes: float
 ) -> tuple[Allowed, Finding]:
     """Return the limits for a clip with the radiance of `image` (any shape, W m^-2 sr^-1), and the finding."""
-    mean, white = float(image.mean()), white_in(image)
+    mean = float(image.mean())
+    white = white_in(image)
     target = white * 10 ** (-psnr / 20)
     rule = f"{WHITE_PER_MEAN:g} x the mean" if white == WHITE_PER_MEAN * mean else "the 99.9th percentile"
     brighter = float((image > white).mean())
@@ -246,15 +252,18 @@ def fewest_instants(extent: Array, contrast: float, changes: Callable[[int], flo
     count = 3
     while blur_error(fastest, count) > edge and count < MOST_INSTANTS:
         count += 6  # 3, 9, 15 ...: one instant lies at mid-exposure, and every third shows what more would change
-    by_motion, tried = count, {}
+    by_motion = count
+    tried = {}
     while count <= MOST_TRIED:
         tried[count] = changes(count)
         if tried[count] <= SHARE:
             break
         count += 6
-    found, power = tried.get(count, 0.0), 1.0
+    found = tried.get(count, 0.0)
+    power = 1.0
     if tried and count not in tried:  # extrapolate by the power of the trials
-        few, most = min(tried), max(tried)
+        few = min(tried)
+        most = max(tried)
         if few < most:
             power = min(max(math.log(tried[few] / tried[most]) / math.log(most / few), 0.5), 2.0)
         wanted = min(most * (tried[most] / SHARE) ** (1 / power), MOST_INSTANTS)

@@ -39,7 +39,8 @@ def flow_between(scene: Scene, rays: Array, hits: Hits, t: float, later: float) 
     `rays` [3, N] are those of the hits at time t. The later rays [3, N] are in the later camera's axes, with the
     points at `hits.distance` lengths. For a point behind the later camera, flow is 0 and not inside.
     """
-    before, camera = scene.camera.at(t), scene.camera.at(later)
+    before = scene.camera.at(t)
+    camera = scene.camera.at(later)
     start, end = seen_again(scene, rays, hits, t, later)
     ahead = end[2] > 0
     place = camera.seen(end[:2] / np.where(ahead, end[2], 1.0))
@@ -64,7 +65,8 @@ def motion_extent(scene: Scene, rays: Array, hits: Hits, t: float, exposure: flo
     speed at t alone.
     """
     parts = (0.0,) if sharp else SPEED_PARTS
-    fastest, step = np.zeros(rays.shape[1]), exposure / SPEED_STEPS
+    fastest = np.zeros(rays.shape[1])
+    step = exposure / SPEED_STEPS
     for part in parts:
         ends = [t + part * exposure + step / 2, t + part * exposure - step / 2]
         late, early = (flow_between(scene, rays, hits, t, end)[0] for end in ends)
@@ -79,9 +81,11 @@ def seen_again(scene: Scene, rays: Array, hits: Hits, t: float, later: float) ->
     The first result differs from `rays` only for deforming bodies: their points are rebuilt from their triangles, with
     the same rounding at both times.
     """
-    before, after = scene.camera.pose(t), scene.camera.pose(later)
+    before = scene.camera.pose(t)
+    after = scene.camera.pose(later)
     inverse = 1 / hits.distance
-    start, end = rays, _moved(rays, inverse, before, np.eye(4), after)
+    start = rays
+    end = _moved(rays, inverse, before, np.eye(4), after)
     for number in np.flatnonzero(np.bincount(hits.number + 1)[1:]).tolist():
         body = scene.bodies[number] if number < len(scene.bodies) else None
         if body is not None and body.deforms:
@@ -91,7 +95,8 @@ def seen_again(scene: Scene, rays: Array, hits: Hits, t: float, later: float) ->
                 points = _points(body, hits, chosen, moment) - view[:3, 3]
                 ends[:, chosen] = view[:3, :3].T @ points.T * inverse[chosen]
             continue
-        here, there = body_pose(scene, number, t), body_pose(scene, number, later)
+        here = body_pose(scene, number, t)
+        there = body_pose(scene, number, later)
         if not np.array_equal(here, there):
             chosen = np.flatnonzero(hits.number == number)
             motion = there @ np.linalg.inv(here)
@@ -122,5 +127,6 @@ def _points(body: Body, hits: Hits, chosen: Array, t: float) -> Array:
     """Return world points [n, 3] of the chosen hits at time t [s], rebuilt from their triangles."""
     corners = body.vertices(t)[body.mesh.faces[hits.triangle[chosen]]]
     weights = hits.weights[chosen]
-    pose, first = body.pose(t), 1 - weights.sum(axis=1)
+    pose = body.pose(t)
+    first = 1 - weights.sum(axis=1)
     return np.einsum("nij,ni->nj", corners, np.column_stack([first, weights])) @ pose[:3, :3].T + pose[:3, 3]

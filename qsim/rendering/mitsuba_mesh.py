@@ -11,13 +11,17 @@ from qsim.rendering.engine import errors_only
 from qsim.scene import Mesh
 
 # The only names of a mesh's parameters in this project; Mitsuba 3.10 renames them.
-POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
+POSITIONS = "vertex_positions"
+NORMALS = "vertex_normals"
+TEXCOORDS = "vertex_texcoords"
+FACES = "faces"
 
 
 def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any, faces: range | None = None) -> Any:
     """Return a Mitsuba mesh with these vertices [V, 3] in m, of all or some faces; `properties` holds its bsdf."""
     used = vertices_of(mesh, faces)
-    shown, uv = mesh.faces, mesh.uv
+    shown = mesh.faces
+    uv = mesh.uv
     if faces is not None:
         shown = np.searchsorted(used, mesh.faces[faces.start : faces.stop])
         uv = None if uv is None else uv[used]

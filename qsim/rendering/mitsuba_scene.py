@@ -189,7 +189,8 @@ def film_pass(
 
     `ValueError` for a lens that distorts, zooms, or whose axis is off the middle: that camera has none.
     """
-    mi, camera = stage.mi, stage.scene.camera
+    mi = stage.mi
+    camera = stage.scene.camera
     shifted = camera.lens is not None and (camera.lens.distorts or camera.lens.shift != (0.0, 0.0))
     if shifted or camera.zoom is not None:
         raise ValueError(

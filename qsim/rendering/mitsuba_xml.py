@@ -29,7 +29,9 @@ from qsim.rendering.mitsuba_mesh import POSITIONS
 from qsim.scene import MitsubaFile, Part, Scene
 from qsim.scene.flicker import Flicker
 
-F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera made from the file's sensor, which has no pixels in metres
+# of the camera made from the file's sensor, which has no pixels in metres
+F_NUMBER = 2.8
+PITCH = 1.1e-6
 MOVABLE = ("to_world", POSITIONS)
 REJECTIONS = (  # what Mitsuba raises for files that it cannot load
     *(RuntimeError, ValueError, TypeError, LookupError, AttributeError, UnicodeError, RecursionError, OSError),
@@ -67,7 +69,8 @@ def read_mitsuba(
         activate(in_colour(engine))
     import mitsuba as mi
 
-    path, motions = Path(xml), motions or {}
+    path = Path(xml)
+    motions = motions or {}
     loaded = load(mi, str(path))
     if not loaded.emitters():
         raise ValueError(f"{path}: no emitter, every pixel would be black; add one")

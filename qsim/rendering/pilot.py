@@ -25,7 +25,9 @@ from qsim.rendering.renderer import Renderer
 from qsim.scene import Scene, Still
 
 COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
-FEWEST, RISE = 4, 1.25  # samples that are tried if COUNTS[0] leave room, and the least by which they raise the error
+# samples that are tried if COUNTS[0] leave room, and the least by which they raise the error
+FEWEST = 4
+RISE = 1.25
 PIXELS = 3000  # of the frame that a pilot renders, about
 MOST_MORE = 3  # frames added for hidden bodies, and as many for fast motion
 STRENGTHS = 6  # frames in which flickering light is rendered
@@ -122,7 +124,8 @@ class Pilot:
 
         The root of mean square over mean of their strengths, of the light that varies most.
         """
-        renderer, most = self.renderer, 1.0
+        renderer = self.renderer
+        most = 1.0
         windows = [np.transpose(light_windows(self.exposed(t, count), renderer.exposure)) for t in self.times]
         for flicker in renderer.scene.flickers.values():
             strengths = np.stack([flicker.mean(start, stop) for start, stop in windows])
@@ -146,7 +149,8 @@ def _lit(renderer: Renderer, frames: int) -> tuple[int, dict[int, int]]:
     strengths = np.sum(list(renderer.strengths(frames).values()), axis=0)
     places = (np.arange(STRENGTHS) + 0.5) / STRENGTHS * frames
     times = np.argsort(strengths, kind="stable")[places.astype(int)].tolist()
-    brightest, bright = int(np.argmax(strengths)), strengths >= strengths.max() / 2
+    brightest = int(np.argmax(strengths))
+    bright = strengths >= strengths.max() / 2
     if bright[times].any():
         return brightest, dict.fromkeys(times, 1)
     flashes = int(np.count_nonzero(bright))  # less than a twelfth of the frames
@@ -198,7 +202,8 @@ def denoised_samples(
     allowed one. `wanted` None denoises only if that costs less. `expected(samples)` are the errors of raw samples; they
     replace a trial that missed rare paths, which shows as noise far below them.
     """
-    renderer, t = pilot.renderer, pilot.middle
+    renderer = pilot.renderer
+    t = pilot.middle
     camera = renderer.scene.camera
     if renderer.engine.backend == "scalar" or not available():
         return None, Finding("denoiser", "off", "not installed" if not available() else "needs LLVM or CUDA")
@@ -210,12 +215,14 @@ def denoised_samples(
     if not tried:
         return None, cheap
     parts = [renderer.window(crop) for crop in windows(camera)]
-    times, key = pilot.exposed(t, count), renderer.key(t, STAGE)
+    times = pilot.exposed(t, count)
+    key = renderer.key(t, STAGE)
     surfaces = [window.surfaces(times, key) for window in parts]
 
     def trial(samples: int) -> dict[str, float]:
         """Return the error by quality, over what is allowed."""
-        halves, found = [window.halves(times, Budget(samples, bounces), key) for window in parts], {}
+        halves = [window.halves(times, Budget(samples, bounces), key) for window in parts]
+        found = {}
         noisy = _root_mean([Errors.of_halves(pair, allowed.white).plain for pair in halves])
         for quality in DENOISE_COST if samples <= MOST_FASTER * count else ["high"]:
             each = zip(halves, surfaces, strict=True)
@@ -261,7 +268,8 @@ def _enough(tried: list[int], errors: dict[str, list[float]], share: float, coun
 
 def windows(camera: Camera) -> list[tuple[int, int, int, int]]:
     """Return the windows (y, x, height, width) for the denoiser's trial: a small frame itself, or four of its parts."""
-    height, width = camera.height, camera.width
+    height = camera.height
+    width = camera.width
     if height * width <= 4 * WINDOW**2:
         return [(0, 0, height, width)]
     rows, columns = (max(1, min(side // 2, WINDOW)) for side in (height, width))

@@ -39,7 +39,8 @@ class RayCaster:
 
     def cast(self, pose: Array, rays: Array) -> Hits:
         """Return the first hits along rays [3, N] in the axes of a camera with this pose [4, 4]."""
-        origin, directions = pose[:3, 3], pose[:3, :3] @ rays
+        origin = pose[:3, 3]
+        directions = pose[:3, :3] @ rays
         if self._scalar:
             return self._cast_one_by_one(origin, directions)
         import drjit as dr
@@ -53,7 +54,8 @@ class RayCaster:
         hit = found.is_valid()
         index = _index(mi, found)
         distance = dr.select(hit, found.t / length, dr.inf)
-        triangle, weights = dr.select(hit, found.prim_index, 0), dr.select(hit, found.prim_uv, 0)
+        triangle = dr.select(hit, found.prim_index, 0)
+        weights = dr.select(hit, found.prim_uv, 0)
         dr.eval(index, distance, triangle, weights)  # together: separate evaluations would cast the rays again
         shape = np.minimum(np.array(index), len(self._numbers) - 1)
         number = self._numbers[shape]
@@ -78,10 +80,13 @@ class RayCaster:
 
     def _cast_one_by_one(self, origin: Array, directions: Array) -> Hits:
         mi = self._mi
-        numbers, first_faces = self._stage.shape_numbers(), self._stage.first_faces()
+        numbers = self._stage.shape_numbers()
+        first_faces = self._stage.first_faces()
         lengths = np.linalg.norm(directions, axis=0)
-        distance, number = np.full(len(lengths), np.inf), np.full(len(lengths), -1, np.int32)
-        triangle, weights = np.zeros(len(lengths), np.int64), np.zeros((len(lengths), 2))
+        distance = np.full(len(lengths), np.inf)
+        number = np.full(len(lengths), -1, np.int32)
+        triangle = np.zeros(len(lengths), np.int64)
+        weights = np.zeros((len(lengths), 2))
         for i, (direction, length) in enumerate(zip(directions.T, lengths, strict=True)):
             ray = mi.Ray3f(origin.tolist(), (direction / length).tolist())
             found = self._stage.loaded.ray_intersect_preliminary(ray)

@@ -142,7 +142,8 @@ class Renderer:
 
     def strengths(self, frames: int) -> dict[str, Array]:
         """Return the mean strength of each flickering light (`Scene.flickers`) in frames 0 ... frames - 1, [frames]."""
-        middle, half = np.arange(frames) / self.frame_rate, self.exposure / 2
+        middle = np.arange(frames) / self.frame_rate
+        half = self.exposure / 2
         return {name: flicker.mean(middle - half, middle + half) for name, flicker in self.scene.flickers.items()}
 
     @in_own_variant
@@ -153,7 +154,8 @@ class Renderer:
         sharp = None
         if self.shutter > 0 and self.budget.sharp:  # the truth of scores: the larger error of both is stated
             sharp, other, others_at, more = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))
-            error, fireflies = max(error, other), fireflies + more
+            error = max(error, other)
+            fireflies = fireflies + more
             errors_at = tuple((white, max(at, error_at(white, others_at or errors_at))) for white, at in errors_at)
         # Last: it leaves the scene at t + 1, where the next frame starts.
         return Frame(radiance, error, errors_at, fireflies, sharp, **(self.truth(t) if with_truth else {}))
@@ -186,7 +188,8 @@ class Renderer:
 
         The instants [s] are the middles of equal parts of an exposure; lights have their mean over `light_windows`.
         """
-        n, samples = len(instants), budget.grid(len(instants))
+        n = len(instants)
+        samples = budget.grid(len(instants))
         parts = self.film.parts(2 * samples)
         seeds = words(key, (2, n * len(parts))).reshape(2, n, len(parts))
         sums = np.zeros((3, 2, *(() if self.scene.bands is None else (3,)), math.prod(self.shape)))
@@ -224,13 +227,16 @@ class Renderer:
         Seed, scene and `stage` select the samples.
         """
         every = range(2**32) if frames is None else range(frames)
-        integrator, each, key = self._integrator(budget.bounces), budget.grid(1), partial(self.key, stage=stage)
+        integrator = self._integrator(budget.bounces)
+        each = budget.grid(1)
+        key = partial(self.key, stage=stage)
         return Carrier(self.stage, self.film, self._caster, integrator, each, budget.neighbours, every, self.time, key)
 
     def _shared(self, t: int, whole: Renderer) -> Exposed:
         """Return the same as `_exposed` of a frame that shares samples, cut from the complete frame."""
         pictures = self._carrier.pictures(t)
-        own, broken = pictures[0], ~np.isfinite(pictures[0]).all(axis=0)
+        own = pictures[0]
+        broken = ~np.isfinite(pictures[0]).all(axis=0)
         pictures[:, :, broken] = 0
         white = self.budget.white or white_in(own.mean(axis=0))
         surfaces = whole.surfaces([self.time(t)], self.key(t)) if self.budget.denoise else None
@@ -244,15 +250,18 @@ class Renderer:
     def _exposed(self, instants: list[float], key: Key) -> Exposed:
         """Return the mean radiance [H, W], its rms error, that error at some whites, and the fireflies."""
         means = self.means(instants, self.budget, key)
-        halves, broken = means[0], ~np.isfinite(means[0]).all(axis=0)
+        halves = means[0]
+        broken = ~np.isfinite(means[0]).all(axis=0)
         means[:, :, broken] = 0  # they would break the denoiser and every mean around them
-        error, radiance = rms((halves[0] - halves[1]) / 2), halves.mean(axis=0)
+        error = rms((halves[0] - halves[1]) / 2)
+        radiance = halves.mean(axis=0)
         fireflies = int(np.count_nonzero(fireflies_in(halves, broken)))
         white = self.budget.white or white_in(radiance)
         mixed = None
         if self.budget.denoise:
             mixed = cleaned_mean(halves, *self.surfaces(instants, key), white, self.budget.quality)
-            radiance, error = mixed.picture, mixed.error
+            radiance = mixed.picture
+            error = mixed.error
 
         def clamped(white: float) -> float:
             noise = mixed.error_at(white) if mixed else Errors.of_halves(halves, white).at_white
@@ -322,7 +331,10 @@ class Renderer:
     @in_own_variant
     def truth(self, t: int) -> dict[str, Array]:
         """Return flow, validity, depth and body of frame t at mid-exposure, as in `Frame`."""
-        camera, now, after, shape = self.scene.camera, self.time(t), self.time(t + 1), self.shape
+        camera = self.scene.camera
+        now = self.time(t)
+        after = self.time(t + 1)
+        shape = self.shape
         rays = pixel_rays(camera.at(now), self.crop, self.film.thinned)
         self.stage.place(now)
         hits = self._caster.cast(camera.pose(now), rays)
@@ -344,7 +356,8 @@ class Renderer:
 
         With the shutter at 0, it is the motion per frame time at the speed of that instant.
         """
-        now, exposure = self.time(t), self.exposure
+        now = self.time(t)
+        exposure = self.exposure
         rays = pixel_rays(self.scene.camera.at(now), self.crop, self.film.thinned)
         self.stage.place(now)
         hits = self._caster.cast(self.scene.camera.pose(now), rays)
@@ -361,5 +374,6 @@ def fireflies_in(halves: Array, broken: Array) -> Array:
 
 
 def _checked_crop(scene: Scene, crop: Crop | None) -> Crop:
-    height, width = scene.camera.height, scene.camera.width
+    height = scene.camera.height
+    width = scene.camera.width
     return (0, 0, height, width) if crop is None else check_crop(crop, height, width)

@@ -40,7 +40,9 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 BANDS = ("tab:red", "tab:green", "tab:blue")  # curves of the bands R, G and B
-_SAMPLES, _PIXELS = 6, 4096  # about the largest numbers of frames, and of pixels of each, in an expected histogram
+# about the largest numbers of frames, and of pixels of each, in an expected histogram
+_SAMPLES = 6
+_PIXELS = 4096
 
 
 def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
@@ -138,10 +140,12 @@ def in_bands(clip: Clip) -> str:
 def stream_line(stream: Stream) -> str:
     """Return sensor and light level of a stream as one line."""
     meta = stream.meta
-    ppp, lux = meta.get("ppp"), meta.get("equivalent_lux_555nm")
+    ppp = meta.get("ppp")
+    lux = meta.get("equivalent_lux_555nm")
     light = "" if ppp is None else f": {ppp:.4g} photons per pixel (the clip's light × {stream.photons_factor:.4g})"
     light += "" if lux is None else f", equal to {lux:.4g} lx at 555 nm"
-    efficiency, colours = stream.sensor.efficiency, stream.colour_filter
+    efficiency = stream.sensor.efficiency
+    colours = stream.colour_filter
     if ppp is not None:
         electrons = efficiency if colours is None else colours.mean_efficiency(efficiency)
         about, bands = ("", "") if colours is None else ("about ", " with equal bands")
@@ -274,12 +278,14 @@ def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64
         if stream.colour_filter is not None:
             each = stream.colour_filter.mosaic(each, stream.sensor.efficiency)
         light.append(each[::step, ::step].copy())  # not a view, which would keep the whole frame in memory
-    sensor, maps = stream.sensor, fixed_pattern.PERFECT
+    sensor = stream.sensor
+    maps = fixed_pattern.PERFECT
     if "defects" in stream.meta:
         found = defect_table.from_dict(stream.meta["defects"], f"{stream.name}: defects")
         device = PixelArray.of(found, sensor, height, width, stream.origin)
         thinned = {name: None if m is None else m[::step, ::step] for name, m in vars(device.maps).items()}
-        sensor, maps = device.sensor, fixed_pattern.Maps(**thinned)
+        sensor = device.sensor
+        maps = fixed_pattern.Maps(**thinned)
     probabilities = fixed_pattern.pmf(sensor, np.stack(light), stream.exposure, maps)
     mean: NDArray[np.float64] = probabilities.reshape(-1, probabilities.shape[-1]).mean(axis=0)
     return mean

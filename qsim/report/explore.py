@@ -55,7 +55,8 @@ def stored_light(clip: Clip) -> StoredLight:
     factor = light_level(clip, ppp=1.0).factor
     _, height, width = clip.shape
     step = ceil(sqrt(height * width / PIXELS))
-    rows, columns = min(step, height), min(step, width)
+    rows = min(step, height)
+    columns = min(step, width)
     frames = np.stack([_reduced(clip_photons(clip, t, factor), rows, columns) for t in range(min(len(clip), FRAMES))])
     brightest = float(frames.max()) or 1.0
     return StoredLight(np.rint(_STEPS * np.sqrt(frames / brightest)).astype(np.uint16), brightest, rows, columns)
@@ -63,7 +64,8 @@ def stored_light(clip: Clip) -> StoredLight:
 
 def _reduced(frame: NDArray[np.floating], rows: int, columns: int) -> NDArray[np.float64]:
     """Return the means [H // rows, W // columns] of blocks of a frame [H, W]; incomplete blocks are cut off."""
-    height, width = frame.shape[0] // rows, frame.shape[1] // columns
+    height = frame.shape[0] // rows
+    width = frame.shape[1] // columns
     blocks = frame[: height * rows, : width * columns].reshape(height, rows, width, columns)
     return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float64))
 

@@ -109,7 +109,8 @@ def stream_panels(stream: Stream, frames: range, truth: Photons | None = None) -
     are left in the light.
     """
     reach = colour.AVERAGE // 2
-    first, last = max(frames.start - reach, 0), min(frames.stop + reach, len(stream))
+    first = max(frames.start - reach, 0)
+    last = min(frames.stop + reach, len(stream))
     codes = stream.codes(first, last)
     averages = np.stack([codes[max(t - reach - first, 0) : t + reach + 1 - first].mean(axis=0) for t in frames])
     shown = codes[frames.start - first : frames.stop - first]
@@ -123,8 +124,10 @@ def stream_panels(stream: Stream, frames: range, truth: Photons | None = None) -
             page.Panel(names[0], fit(shown_codes, filters)),
             page.Panel(names[1], fit(colour.tone(averages, colour.peak(averages)), filters)),
         ]
-    light, average = one(shown), many(averages)
-    mosaic, picture = truth, average
+    light = one(shown)
+    average = many(averages)
+    mosaic = truth
+    picture = average
     if filters is not None:
         mosaic = None if truth is None else filters.mosaic(truth, stream.sensor.efficiency)
         if determines_bands(filters, stream.sensor.efficiency):

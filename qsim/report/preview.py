@@ -39,7 +39,9 @@ class Sheet:
         return np.pad(sheet, ((0, sheet.shape[0] % 2), (0, sheet.shape[1] % 2), (0, 0)), constant_values=PAPER)
 
 
-GAP, PAPER, INK = 6, 250, (40, 40, 44)
+GAP = 6
+PAPER = 250
+INK = (40, 40, 44)
 SMALLEST = 224  # least columns of an enlarged picture
 NARROWEST = 112  # least columns of a caption and its legend
 

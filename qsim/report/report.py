@@ -42,7 +42,9 @@ from qsim.report.panels import (
     truth_photons,
 )
 
-_SENTENCES, _FACTS = 4, 8  # at most on top of a page
+# at most on top of a page
+_SENTENCES = 4
+_FACTS = 8
 _STORY = ("dataset", "training", "evaluation", "static", "restored", "study", "clip")  # the kinds in that order
 INSIDE_CLIPS = {"streams", "truth", "radiance", "sharp", "jobs", "failed", "logs", "locks", "work"}
 
@@ -147,7 +149,10 @@ def _steps(kind: str, file: Path) -> int:
 def dataset_sections(path: Path, step: Callable[[], None] = lambda: None) -> list[page.Section]:
     """Return a table of the clips of a data set and the first clip of each split; call `step` after each clip."""
     data = Dataset.open(path.parent)
-    rows, below, splits, total = [], set(), [], 0
+    rows = []
+    below = set()
+    splits = []
+    total = 0
     for name in data.names():
         clip = Clip.open(data.path / "clips" / name)
         split = data.meta["jobs"][name]["split"]
@@ -155,15 +160,32 @@ def dataset_sections(path: Path, step: Callable[[], None] = lambda: None) -> lis
         frames, height, width = clip.shape
         total += frames
         mean, largest = motion(clip, [len(clip) // 2]) if clip.has_truth else (None, None)
-        size, found = f"{frames} × {height} × {width}", stated(clip.meta)
-        rows.append([name, split, size, clip.mean_radiance, clip.meta.get("mean_photons"), mean, largest,
-                     None if found is None else found.psnr])  # fmt: skip
+        size = f"{frames} × {height} × {width}"
+        found = stated(clip.meta)
+        rows.append(
+            [
+                name,
+                split,
+                size,
+                clip.mean_radiance,
+                clip.meta.get("mean_photons"),
+                mean,
+                largest,
+                None if found is None else found.psnr,
+            ]
+        )
         below |= set() if found is None else {found.below.split(" (")[0]}
         step()
     headers = [
-        "clip", "split", "frames × rows × columns", "mean radiance", "photons per pixel",
-        "motion [px/frame]", "largest [px/frame]", "noise floor [dB]",
-    ]  # fmt: skip
+        "clip",
+        "split",
+        "frames × rows × columns",
+        "mean radiance",
+        "photons per pixel",
+        "motion [px/frame]",
+        "largest [px/frame]",
+        "noise floor [dB]",
+    ]
     missing = f"; missing: {', '.join(data.missing)}" if data.missing else ""
     caption = (
         f"{len(rows)} clips{missing}; motion in the middle frame, of pixels that move more than {MOVING:g} px; noise "
@@ -186,17 +208,20 @@ def restored_section(path: Path) -> page.Section:
     Flow, depth, bodies and hidden points of the clip lie over its light.
     """
     video = Restored.open(path)
-    meta, restored = video.meta, video.frames()
+    meta = video.meta
+    restored = video.frames()
     frames = chosen_frames(len(restored), *restored.shape[-2:])
     shown = np.asarray(restored[: len(frames)])
     clip, stream = _source(meta)
-    name, truth = str(meta["method"]), None
+    name = str(meta["method"])
+    truth = None
     panels: list[page.Panel] = []
     if clip is not None and stream is not None:
         truth = truth_photons(clip, stream, frames)
     white = colour.peak(shown if truth is None else truth)
     own = page.Panel(f"restored by {name}", fit(toned(shown, white)), score(shown, truth))
-    wheel, lines = None, [f"{meta.get('description', name)}; {page.seconds_text(meta['seconds_per_frame'])} per frame."]
+    wheel = None
+    lines = [f"{meta.get('description', name)}; {page.seconds_text(meta['seconds_per_frame'])} per frame."]
     if clip is None or stream is None or truth is None:
         panels = [own]
         if clip is None and Path(f"{meta.get('source') or 'none'}").with_suffix(".json").is_file():
@@ -230,10 +255,12 @@ def _source(meta: dict[str, Any]) -> tuple[Clip | None, Stream | None]:
     """Return the clip and stream of a restored video, or (None, None) if they are no longer there, or were replaced."""
     path = Path(f"{meta.get('source') or 'none'}")
     try:
-        clip, stream = Clip.open(path.parents[1]), Stream.open(path.with_suffix(".json"))
+        clip = Clip.open(path.parents[1])
+        stream = Stream.open(path.with_suffix(".json"))
     except (IndexError, ValueError, OSError):
         return None, None
-    now, shape = stream.meta.get("sha256"), meta.get("shape") or stream.shape
+    now = stream.meta.get("sha256")
+    shape = meta.get("shape") or stream.shape
     same = (meta.get("source_sha256") or now) == now and (shape[0], *shape[-2:]) == tuple(stream.shape)
     return (clip, stream) if same else (None, None)
 

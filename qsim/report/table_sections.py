@@ -61,7 +61,8 @@ _SUFFIXES = (
 def training_section(path: Path) -> page.Section:
     """Return the learning curve: PSNR of the validation clips against minutes, with the weights that were kept."""
     history = files.read_json(path)["history"]
-    name, steps = path.parent.name, f"{history[-1]['step']} steps in {history[-1]['elapsed'] / 60:.1f} minutes"
+    name = path.parent.name
+    steps = f"{history[-1]['step']} steps in {history[-1]['elapsed'] / 60:.1f} minutes"
     known = [(entry["elapsed"] / 60, entry["psnr_matched"]) for entry in history if _is_number(entry["psnr_matched"])]
     if not known:
         story = f"Training {name}: no validation has a finite score."
@@ -69,7 +70,8 @@ def training_section(path: Path) -> page.Section:
     minutes, scores = zip(*known, strict=True)
     axes, save = page.axes("minutes of training", "validation PSNR, matched [dB]")
     axes.plot(minutes, scores, ".-")
-    best, last = max(range(len(scores)), key=scores.__getitem__), history[-1]["psnr_matched"]
+    best = max(range(len(scores)), key=scores.__getitem__)
+    last = history[-1]["psnr_matched"]
     axes.plot(minutes[best], scores[best], "o", color="tab:orange", label="best, kept")
     axes.legend()
     story = f"Training {name} reached {scores[best]:.2f} dB on the validation clips after {minutes[best]:.1f} minutes."
@@ -181,7 +183,8 @@ def _score(line: dict[str, Any], name: str, digits: int) -> str:
 
 def _pm(interval: dict[str, Any], digits: int) -> str:
     """Return "23.45 ± 0.67", without the half-width if there is one scene; "inf" for the text that stands for it."""
-    mean, half = interval["mean"], interval["half_width"]
+    mean = interval["mean"]
+    half = interval["half_width"]
     if mean is None:
         return "n/a"
     return f"{float(mean):.{digits}f}" + (f" ± {half:.{digits}f}" if isinstance(half, int | float) else "")
@@ -233,8 +236,11 @@ def study_section(path: Path) -> page.Section:
         rows = [{"clip": row["clip"]} | panel for row in rows for panel in row["panels"]]
     words = {key: value for key, value in found.items() if isinstance(value, int | float | str)}
     keys = list(dict.fromkeys(key for row in rows for key in row if not isinstance(row[key], list | dict)))
-    table = page.table(page.Table(f"{len(rows)} rows", [_heading(key) for key in keys],
-                                  [[row.get(key) for key in keys] for row in rows]))  # fmt: skip
+    table = page.table(
+        page.Table(
+            f"{len(rows)} rows", [_heading(key) for key in keys], [[row.get(key) for key in keys] for row in rows]
+        )
+    )
     lines = [f"{_heading(key)}: {page.number_text(value)}" for key, value in words.items()]
     picture = path.with_name("best.png" if "cells" in found else f"{path.stem}.png")  # of a sweep, or of one study
     name = f"{path.parent.name}/{picture.name}"
@@ -270,7 +276,8 @@ def validation_section(path: Path) -> page.Section:
         rows = [row for row in found["rows"] if row["cdf_error"]]
         for engine in dict.fromkeys(row["engine"] for row in rows):
             own = [row for row in rows if row["engine"] == engine]
-            speeds, errors = [row["megapixels_per_second"] for row in own], [row["cdf_error"] for row in own]
+            speeds = [row["megapixels_per_second"] for row in own]
+            errors = [row["cdf_error"] for row in own]
             axes.plot(speeds, errors, "o", label=engine)
         axes.set_yscale("log")
         keys = ["model", "engine", "megapixels_per_second", "times_numpy", "cdf_error"]

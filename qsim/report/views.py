@@ -130,7 +130,8 @@ def _stream_source(stream: Stream) -> Source:
     def read(start: int, stop: int) -> NDArray[Any]:
         return stream.codes(start, stop)
 
-    filters, own = stream.colour_filter, stream.sensor.efficiency
+    filters = stream.colour_filter
+    own = stream.sensor.efficiency
     bands = None
     if filters is not None and determines_bands(filters, own):  # else one filter over all pixels, shown in grey
         bands = partial(demosaic, filters=filters, efficiency=own)
@@ -145,7 +146,8 @@ def _array_source(path: Path, bits: int | None, width: int | None, described: di
     rate = described.get("frame_rate")
     if array.dtype.kind == "f":
         _refuse(path, "an array of values, not of codes", bits=bits, width=width)
-        what, unit = described.get("method", "values"), described.get("unit", "as stored")
+        what = described.get("method", "values")
+        unit = described.get("unit", "as stored")
         title = f"restored by {what}" if "method" in described else what
         view = _light_view("values", title, unit, length, lambda t: np.asarray(array[t], np.float64))
         return Source(path.stem, length, rate, {"values": view})

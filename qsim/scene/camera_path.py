@@ -244,13 +244,15 @@ def _seen_from(found: dict[str, Any], where: str, like: Camera, pose: Array, siz
     stated = {key: found[key] for key in _KEYS if found.get(key) is not None}
     if not sized and not {"w", "h"} <= stated.keys():
         raise ValueError(f"{where}: states no w and h; give a camera of the size of its pictures, like=Camera(...)")
-    height, width = int(stated.get("h", like.height)), int(stated.get("w", like.width))
+    height = int(stated.get("h", like.height))
+    width = int(stated.get("w", like.width))
     if "fl_x" not in stated and "camera_angle_x" not in stated:
         raise ValueError(f"{where}: states neither fl_x nor camera_angle_x; one of them gives the view")
     focal, aspect = _focal(stated, width)
     shift = ((stated.get("cx", width / 2) - width / 2) / height, (stated.get("cy", height / 2) - height / 2) / height)
     falloff = () if like.lens is None else like.lens.falloff
-    distance, ahead = focal * like.pixel_pitch, like.focus
+    distance = focal * like.pixel_pitch
+    ahead = like.focus
     try:
         bent = Lens(falloff=falloff, shift=shift, aspect=aspect, **{key: stated.get(key, 0.0) for key in TERMS})
         return replace(
@@ -294,9 +296,11 @@ def _focal(stated: dict[str, Any], width: int) -> tuple[float, float]:
     """Return the focal length [heights of a pixel] of a picture of this width [px], and fl_x over fl_y."""
     across = stated.get("fl_x") or width / 2 / math.tan(stated["camera_angle_x"] / 2)
     if {"fl_x", "fl_y"} <= stated.keys():
-        down, allowed = stated["fl_y"], SQUARE
+        down = stated["fl_y"]
+        allowed = SQUARE
     elif {"w", "h", "camera_angle_y"} <= stated.keys():
-        down, allowed = stated["h"] / 2 / math.tan(stated["camera_angle_y"] / 2), SQUARE_BY_ANGLE
+        down = stated["h"] / 2 / math.tan(stated["camera_angle_y"] / 2)
+        allowed = SQUARE_BY_ANGLE
     else:
         return across, 1.0
     return (across, 1.0) if abs(down / across - 1) <= allowed else (down, across / down)

@@ -31,7 +31,8 @@ class Ripple:
 
     def angle(self, places: Array, t: float) -> Array:
         """Return the phase [rad] at the points [V, 3] in m at time t [s], float64 [V]."""
-        x, y = places[:, 0], places[:, 1]
+        x = places[:, 0]
+        y = places[:, 1]
         return 2 * np.pi * (x / self.wavelength - self.frequency * t) + self.slant * y + self.phase
 
 

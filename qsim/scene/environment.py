@@ -23,7 +23,11 @@ RINGING = 0.05  # of an environment's mean; free maps of 1024 x 512 px hold -0.0
 SKY_ROWS = 128  # of both halves; the sky is smooth, and the sun is a separate disk
 
 # CIE S 011/E:2003, standard general sky, type 12 "CIE standard clear sky, low luminance turbidity".
-_A, _B, _C, _D, _E = -1.0, -0.32, 10.0, -3.0, 0.45
+_A = -1.0
+_B = -0.32
+_C = 10.0
+_D = -3.0
+_E = 0.45
 
 
 def sun_direction(light: SunSky) -> Array:
@@ -68,7 +72,8 @@ def sky_map(light: SunSky, rows: int = SKY_ROWS) -> Array:
         ground = light.ground_reflectance * (sunlit + blue) / np.pi
         return np.where(above, sky * blue / irradiance, ground).astype(np.float32)
 
-    sun, blue = light.sun_irradiance, light.sky_irradiance
+    sun = light.sun_irradiance
+    blue = light.sky_irradiance
     if isinstance(sun, tuple) or isinstance(blue, tuple):
         return np.stack([seen(*each) for each in zip(three(sun), three(blue), strict=True)], axis=-1)
     return seen(sun, blue)

@@ -34,7 +34,8 @@ def file_beside(document: Path, where: str, name: str, folder: Path | None = Non
     root = document.parent.resolve()
     target = (folder or document.parent) / name
     try:
-        inside, there = target.resolve().is_relative_to(root), target.exists()
+        inside = target.resolve().is_relative_to(root)
+        there = target.exists()
     except OSError as error:  # a name that is too long
         raise ValueError(f"{where}: uri {name[:60]!r} is no name of a file ({error.strerror})") from None
     if not inside:

@@ -89,7 +89,8 @@ def _read_radiance(path: Path) -> Array:
     if not head.startswith(b"#?") or len(words) != 4 or (words[0], words[2]) != (b"-Y", b"+X"):
         raise ValueError(f"environment {path}: not a Radiance .hdr file with rows from top to bottom")
     exposure = _exposure(path, head.decode("latin-1"))
-    height, width = int(words[1]), int(words[3])
+    height = int(words[1])
+    width = int(words[3])
     rgbe = np.empty((height, width, 4), np.uint8)
     at = 0
     old = re.search(rb"\x01\x01\x01", body) is not None and body[:2] != b"\x02\x02"
@@ -127,19 +128,22 @@ def _positive(path: Path, value: str) -> float:
 
 def _read_old_row(body: bytes, at: int, row: Array) -> int:
     """Read pixels of which (1, 1, 1, n) repeats the one before; a second such pixel counts 256 times as much."""
-    x, shift = 0, 0
+    x = 0
+    shift = 0
     while x < len(row):
         pixel = np.frombuffer(body, np.uint8, 4, at)
         at += 4
         if tuple(pixel[:3]) != (1, 1, 1):
             row[x] = pixel
-            x, shift = x + 1, 0
+            x = x + 1
+            shift = 0
             continue
         count = int(pixel[3]) << shift
         if not 0 < x + count <= len(row) or x == 0:
             raise ValueError("a run beyond the row")
         row[x : x + count] = row[x - 1]
-        x, shift = x + count, shift + 8
+        x = x + count
+        shift = shift + 8
     return at
 
 
@@ -155,8 +159,10 @@ def _read_row(body: bytes, at: int, row: Array) -> int:
             count = body[at]
             if count > 128:
                 row[x : x + count - 128, channel] = body[at + 1]
-                x, at = x + count - 128, at + 2
+                x = x + count - 128
+                at = at + 2
             else:
                 row[x : x + count, channel] = np.frombuffer(body, np.uint8, count, at + 1)
-                x, at = x + count, at + 1 + count
+                x = x + count
+                at = at + 1 + count
     return at

@@ -206,7 +206,8 @@ Material = Diffuse | RoughPlastic | Conductor | Dielectric | Glow | Patches
 
 
 def _check_reflectance(material: Diffuse | RoughPlastic) -> None:
-    found, kind = material.reflectance, type(material).__name__
+    found = material.reflectance
+    kind = type(material).__name__
     values = list(numbers(found))
     if not isinstance(found, Texture) and not (values and min(values) >= 0 and max(values) <= 1):
         raise ValueError(f"{kind}.reflectance: a number from 0 to 1 or a Texture is expected, got {found!r}")
@@ -221,7 +222,9 @@ def shows_picture(material: Material) -> bool:
 
 def _check_surface(material: Any) -> None:
     """Raise `ValueError` for a roughness outside 0 to 1, and for an index of refraction that Mitsuba does not take."""
-    kind, roughness, ior = type(material).__name__, material.roughness, getattr(material, "ior", 1.5)
+    kind = type(material).__name__
+    roughness = material.roughness
+    ior = getattr(material, "ior", 1.5)
     if not (_is_number(roughness) and 0 <= roughness <= 1):
         raise ValueError(f"{kind}.roughness: a number from 0 to 1 is expected, got {roughness!r}")
     if not (_is_number(ior) and ior > 0):

@@ -99,7 +99,8 @@ def _texture(paint: Paint, coordinates: Sequence[Array]) -> Texture:
         return Texture(Picture(factor.reshape(1, 1, 3)))
     picture, source = paint.image()
     colours = picture.colours * factor if paint.factor != (1.0, 1.0, 1.0) else picture.colours
-    wrap, repeat = list(paint.wrap), [1.0, 1.0]
+    wrap = list(paint.wrap)
+    repeat = [1.0, 1.0]
     if wrap[0] != wrap[1] and coordinates:
         # Mitsuba wraps both axes alike. Within 0 .. 1 a mirrored picture is a clamped one, also between the outermost
         # texels, and a mirrored picture is its double, repeated half as often.
@@ -133,7 +134,8 @@ def mesh_of(pieces: Sequence[Piece], projected: Callable[[Piece, float], Mesh], 
     if not sum(len(piece.faces) for piece in pieces):
         raise ValueError(f"mesh {where}: it contains no triangles")
     used = np.concatenate([piece.vertices[piece.faces].reshape(-1, 3) for piece in pieces])
-    low, high = used.min(0), used.max(0)
+    low = used.min(0)
+    high = used.max(0)
     longest = float((high - low).max())
     if longest == 0:
         raise ValueError(f"mesh {where}: all its vertices lie in one point")
@@ -143,7 +145,10 @@ def mesh_of(pieces: Sequence[Piece], projected: Callable[[Piece, float], Mesh], 
             f"mesh {where}: all its triangles have no area; the file is damaged or of a kind not read here"
         )
     scale = 1.0 if size is None else size / longest
-    vertices, faces, coordinates, start = [], [], [], 0
+    vertices = []
+    faces = []
+    coordinates = []
+    start = 0
     for piece in pieces:
         placed = replace(piece, vertices=(piece.vertices - (low + high) / 2) * scale)
         if placed.uv is None:

@@ -231,7 +231,8 @@ class Keyframes(Motion):
         if not self.times[0] <= t <= self.times[-1]:
             return np.zeros(3), np.zeros(3)
         i, s, length = interval(self.times, t)
-        p, m = np.asarray(self.positions), slopes(self.times, np.asarray(self.positions)) * length
+        p = np.asarray(self.positions)
+        m = slopes(self.times, np.asarray(self.positions)) * length
         rate = (
             6 * (s**2 - s) * (p[i] - p[i + 1]) + (3 * s**2 - 4 * s + 1) * m[i] + (3 * s**2 - 2 * s) * m[i + 1]
         ) / length

@@ -98,7 +98,8 @@ class _Materials:
     def _picture(self, file: Path, where: str, name: str, words: list[str]) -> None:
         if name not in self.paints:
             raise ValueError(f"{where}: map_Kd stands before the first newmtl")
-        wrap, rest = "repeat", list(words)
+        wrap = "repeat"
+        rest = list(words)
         while rest and rest[0].startswith("-"):
             option = rest.pop(0).lower()
             if option not in _OPTIONS:
@@ -137,7 +138,8 @@ def obj_pieces(path: Path) -> list[Piece]:
     text = _text(regular_bytes(path, f"mesh {path}"))
     vertices: list[tuple[float, ...]] = []
     coordinates: list[tuple[float, ...]] = []
-    materials, current = _Materials(path), ""
+    materials = _Materials(path)
+    current = ""
     libraries = 0
     known: dict[str, tuple[int, int]] = {}  # corners by their words, which most vertices share
     faces: dict[tuple[str, bool], list[tuple[tuple[int, int], ...]]] = {}
@@ -170,7 +172,8 @@ def obj_pieces(path: Path) -> list[Piece]:
     materials.finish()
     if any(len(vertex) != 3 for vertex in vertices):
         raise ValueError(f"mesh {path}: a vertex needs three numbers")
-    points, places = np.array(vertices, np.float64).reshape(-1, 3), np.array(coordinates, np.float64).reshape(-1, 2)
+    points = np.array(vertices, np.float64).reshape(-1, 3)
+    places = np.array(coordinates, np.float64).reshape(-1, 2)
     return by_paint([_piece(points, places, np.array(list(faces[key])), key, materials) for key in faces])
 
 
@@ -214,7 +217,8 @@ def _text(raw: bytes) -> str:
 
 def _lines(text: str) -> Iterator[tuple[int, list[str]]]:
     """Yield number and words of every line that has some, without comments; a backslash at its end continues a line."""
-    kept, first = "", 0
+    kept = ""
+    first = 0
     for number, line in enumerate(text.splitlines(), 1):
         first = first or number
         bare = line.partition("#")[0].rstrip()
@@ -224,7 +228,8 @@ def _lines(text: str) -> Iterator[tuple[int, list[str]]]:
         words = (kept + bare).split()
         if words:
             yield first, words
-        kept, first = "", 0
+        kept = ""
+        first = 0
 
 
 def _numbers(where: str, words: list[str]) -> list[float]:

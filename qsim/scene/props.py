@@ -35,7 +35,9 @@ def rotor(blades: int, radius: float, pitch: float = 0.5, width: float = 0.9, sw
     `width` is about the angle [rad] of a blade at its tip, `sweep` the lead of the tip [rad].
     """
     flat = sheet(1.0, 1.0, 16, 24)
-    along, across = flat.vertices[:, 1] + 0.5, flat.vertices[:, 0]  # 0..1 from root to tip; -0.5..0.5 across
+    # 0..1 from root to tip; -0.5..0.5 across
+    along = flat.vertices[:, 1] + 0.5
+    across = flat.vertices[:, 0]
     r = radius * (0.16 + 0.84 * along)
     round_off = np.sqrt(np.clip(1 - np.clip((along - 0.8) / 0.2, 0, 1) ** 2 * 0.6, 0, 1))
     chord = width * radius * (0.35 + 0.65 * along) * round_off * across
@@ -69,9 +71,11 @@ def glyph_outlines(text: str, font: str = "DejaVuSans-Bold") -> list[list[Array]
         raise ValueError(
             f"font {font!r} is not among matplotlib's: {', '.join(sorted(p.stem for p in path.parent.glob('*.ttf')))}"
         )
-    face, em = FT2Font(str(path)), 1000.0
+    face = FT2Font(str(path))
+    em = 1000.0
     face.set_size(em, 72)  # one point is one pixel
-    outlines, pen = [], 0.0
+    outlines = []
+    pen = 0.0
     for character in text:
         glyph = face.load_char(ord(character), flags=LoadFlags.NO_HINTING)
         points, codes = face.get_path()
@@ -110,7 +114,9 @@ def _flattened(points: Array, codes: NDArray[np.integer], steps: int = 5) -> lis
             loops[-1].append(points[i])
         elif codes[i] == CURVE:
             s = np.linspace(0, 1, steps + 1)[1:, None]
-            start, control, end = loops[-1][-1], points[i], points[i + 1]
+            start = loops[-1][-1]
+            control = points[i]
+            end = points[i + 1]
             loops[-1].extend((1 - s) ** 2 * start + 2 * s * (1 - s) * control + s**2 * end)
             i += 1
         i += 1

@@ -59,8 +59,10 @@ def pose_matrix(rotation: Array | None = None, position: ArrayLike = ORIGIN) -> 
 
 def rotation_between(start: ArrayLike, end: ArrayLike) -> Array:
     """Return the shortest rotation from direction `start` to direction `end`, float64 [3, 3]."""
-    a, b = unit(start), unit(end)
-    axis, cosine = np.cross(a, b), float(np.clip(a @ b, -1, 1))
+    a = unit(start)
+    b = unit(end)
+    axis = np.cross(a, b)
+    cosine = float(np.clip(a @ b, -1, 1))
     if np.linalg.norm(axis) < 1e-12:
         if cosine > 0:
             return np.eye(3)
@@ -83,12 +85,15 @@ def logarithm(rotation: ArrayLike) -> Array:
     largest = int(np.argmax(squares))
     skew = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
     if largest == 0:
-        w, v = squares[0], skew
+        w = squares[0]
+        v = skew
     else:
-        w, v = skew[largest - 1], (r + r.T)[largest - 1].copy()
+        w = skew[largest - 1]
+        v = (r + r.T)[largest - 1].copy()
         v[largest - 1] = squares[largest]
     if w < 0:
-        w, v = -w, -v
+        w = -w
+        v = -v
     length = float(np.linalg.norm(v))
     return v * (2 * np.arctan2(length, w) / length) if length > 0 else np.zeros(3)
 

@@ -250,5 +250,6 @@ def _check_motion(scene: str, body: Body | Part) -> None:
         if isinstance(body.motion, Deformation):
             raise ValueError(f"scene {scene}, shape {body.name}: shapes of a Mitsuba file move rigidly, none deforms")
     elif body.deforms and body.vertices(0.0).shape != body.mesh.vertices.shape:
-        expected, found = body.mesh.vertices.shape, body.vertices(0.0).shape
+        expected = body.mesh.vertices.shape
+        found = body.vertices(0.0).shape
         raise ValueError(f"scene {scene}, body {body.name}: deform must keep the mesh's {expected}, got {found}")

@@ -89,7 +89,8 @@ def torus(radius: float, tube: float, segments: int = 64) -> Mesh:
 
 def cylinder(radius: float, height: float, segments: int = 48, taper: float = 1.0) -> Mesh:
     """Return a faceted cylinder around y; `taper` is the top radius over the bottom radius, 0 a cone."""
-    h, top = height / 2, max(radius * taper, 0.0)
+    h = height / 2
+    top = max(radius * taper, 0.0)
     side = revolved([(radius, -h), (top, h)], segments)
     caps = [revolved([(0, -h), (radius, -h)], segments)]
     if top > 0:
@@ -129,7 +130,8 @@ def revolved(profile: Sequence[tuple[float, float]], segments: int = 48) -> Mesh
     u = np.linspace(0, 1, segments + 1)
     steps = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     angle = 2 * np.pi * u[None, :]
-    r, y = line[:, :1], np.repeat(line[:, 1:], segments + 1, axis=1)
+    r = line[:, :1]
+    y = np.repeat(line[:, 1:], segments + 1, axis=1)
     vertices = np.stack([r * np.sin(angle), y, r * np.cos(angle)], -1).reshape(-1, 3)
     uv = np.stack(np.broadcast_arrays(u[None, :], (steps / steps[-1])[:, None]), -1).reshape(-1, 2)
     return Mesh(vertices, _grid_faces(len(line), segments + 1), uv, smooth=True)
@@ -144,12 +146,14 @@ def extruded(outlines: Sequence[ArrayLike], depth: float, texture_size: float = 
     flat, triangles = filled(loops)
     front = np.column_stack([flat, np.full(len(flat), depth / 2)])
     back = front * (1, 1, -1)
-    vertices, faces = [front, back], [triangles, triangles[:, ::-1] + len(flat)]
+    vertices = [front, back]
+    faces = [triangles, triangles[:, ::-1] + len(flat)]
     start = 2 * len(flat)
     for loop in loops:
         n = len(loop)
         ring = np.column_stack([loop, np.full(n, depth / 2)])
-        i, j = np.arange(n), (np.arange(n) + 1) % n
+        i = np.arange(n)
+        j = (np.arange(n) + 1) % n
         wall = np.concatenate([np.stack([i, i + n, j + n], 1), np.stack([i, j + n, j], 1)])
         if not _outside_is_right(loop, loops):
             wall = wall[:, ::-1]
@@ -170,9 +174,11 @@ def filled(loops: Sequence[Array]) -> tuple[Array, NDArray[np.int64]]:
     heights = np.unique(start[:, 1])
     points: list[Array] = []
     for low, high in itertools.pairwise(heights):
-        a, b = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
+        a = np.minimum(start[:, 1], end[:, 1])
+        b = np.maximum(start[:, 1], end[:, 1])
         crossing = (a <= low) & (b >= high) & (b > a)
-        p, q = start[crossing], end[crossing]
+        p = start[crossing]
+        q = end[crossing]
         slope = (q[:, 0] - p[:, 0]) / (q[:, 1] - p[:, 1])
         x = np.stack([p[:, 0] + slope * (y - p[:, 1]) for y in (low, high)], 1)
         x = x[np.argsort(x.sum(1), kind="stable")]
@@ -199,7 +205,8 @@ def wire(path: ArrayLike, radius: float, sides: int = 8, closed: bool = False) -
         side = side - along * (side @ along)
         side = side / np.linalg.norm(side)
         sides_along.append(side)
-    first, last = sides_along[0], sides_along[-1]
+    first = sides_along[0]
+    last = sides_along[-1]
     gained = float(np.arctan2(np.cross(first, last) @ tangent[0], first @ last)) if closed else 0.0
     rings = []
     around = np.linspace(0, 2 * np.pi, sides + 1)
@@ -209,7 +216,8 @@ def wire(path: ArrayLike, radius: float, sides: int = 8, closed: bool = False) -
         rings.append(place + radius * (np.cos(angle) * sides_along[i] + np.sin(angle) * across))
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     if closed:
-        rings, length = [*rings, rings[0]], np.append(length, length[-1] + np.linalg.norm(points[0] - points[-1]))
+        rings = [*rings, rings[0]]
+        length = np.append(length, length[-1] + np.linalg.norm(points[0] - points[-1]))
     uv = np.stack(np.broadcast_arrays(around[None, :] / (2 * np.pi), (length / length[-1])[:, None]), -1)
     return Mesh(np.concatenate(rings), _grid_faces(len(rings), sides + 1), uv.reshape(-1, 2), smooth=True)
 
@@ -260,7 +268,8 @@ def _trimesh_file(path: str | Path, size: float | None) -> Mesh:
     vertices = np.asarray(loaded.vertices, np.float64)
     if len(vertices) == 0 or len(loaded.faces) == 0:
         raise ValueError(f"mesh {path}: it contains no triangles")
-    low, high = vertices.min(0), vertices.max(0)
+    low = vertices.min(0)
+    high = vertices.max(0)
     longest = float((high - low).max())
     if longest == 0:
         raise ValueError(f"mesh {path}: all its vertices lie in one point")
@@ -294,5 +303,6 @@ def _contains(loop: Array, point: Array) -> bool:
     """Return whether a point lies inside one closed loop (even-odd)."""
     (x, y), p, q = point, loop, np.roll(loop, -1, axis=0)
     straddles = (p[:, 1] > y) != (q[:, 1] > y)
-    p, q = p[straddles], q[straddles]
+    p = p[straddles]
+    q = q[straddles]
     return bool(np.sum(x < p[:, 0] + (y - p[:, 1]) / (q[:, 1] - p[:, 1]) * (q[:, 0] - p[:, 0])) % 2)

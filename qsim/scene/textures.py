@@ -40,7 +40,8 @@ def levels(picture: NDArray[np.floating], low: float = 0.1, high: float = 0.8, c
     dark, bright = np.percentile(picture, [1, 99])
     scaled = np.clip((picture - dark) / max(bright - dark, 1e-12), 0, 1)
     if contrast != 1.0:
-        a, b = scaled**contrast, (1 - scaled) ** contrast
+        a = scaled**contrast
+        b = (1 - scaled) ** contrast
         scaled = a / (a + b)
     return (low + (high - low) * scaled).astype(np.float32)
 
@@ -142,7 +143,8 @@ def cells(rng: np.random.Generator, count: int = 120, size: int = 512, joint: fl
 def speckles(rng: np.random.Generator, count: int = 1500, size: int = 512, largest: float = 0.02) -> Picture:
     """Return terrazzo in 0..1: dots of random greys and sizes (fractions of the picture) on a ground; it tiles."""
     picture = np.full((size, size), 0.75, np.float32) + 0.1 * (noise(rng, (size, size), 0.6) - 0.5)
-    places, radii = rng.random((count, 2)) * size, size * largest * rng.beta(1, 4, count) + 0.7
+    places = rng.random((count, 2)) * size
+    radii = size * largest * rng.beta(1, 4, count) + 0.7
     for (cy, cx), radius, tone in zip(places, radii, rng.uniform(0, 1, count), strict=True):
         reach = int(np.ceil(radius)) + 1
         iy, ix = (np.arange(int(c) - reach, int(c) + reach + 1) for c in (cy, cx))
@@ -165,7 +167,8 @@ def lines_of_text(
     font = str(Path(mpl.get_data_path()) / "fonts" / "ttf" / "DejaVuSans-Bold.ttf")
     page = Image.new("L", (width, height), 0)
     draw = ImageDraw.Draw(page)
-    top, margin = 0.04 * height, 0.05 * width
+    top = 0.04 * height
+    margin = 0.05 * width
     for line in lines:
         if not line:
             top += 0.4 * height

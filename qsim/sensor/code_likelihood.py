@@ -72,7 +72,8 @@ def estimate(sensor: Distribution, exposure: float, histogram: Array, confidence
     """Return photons, lower and upper bound (`Estimate`) of one histogram [levels]."""
     codes = np.flatnonzero(histogram)
     likelihood = _Codes(sensor, exposure, codes, histogram[codes])
-    dark, end = sensor.dark_rate * exposure, _saturated(sensor, exposure)
+    dark = sensor.dark_rate * exposure
+    end = _saturated(sensor, exposure)
     for code in _impossible(likelihood, dark, end):
         raise Impossible(code)
     best, one_sided = _highest(likelihood, dark, end)
@@ -100,10 +101,12 @@ def _highest(likelihood: _Codes, dark: float, end: float) -> tuple[float, bool]:
     low = high = middle
     factor = 1.1
     while low > dark and likelihood.score(low) < 0:
-        low, factor = max(dark, low / factor), factor**2
+        low = max(dark, low / factor)
+        factor = factor**2
     factor = 1.1
     while high < end and likelihood.score(high) > 0:
-        high, factor = min(end, high * factor), factor**2
+        high = min(end, high * factor)
+        factor = factor**2
     if high == end and likelihood.score(end) >= 0:
         return end, True
     best = _root(likelihood.score, low, high)
@@ -114,7 +117,8 @@ def _highest(likelihood: _Codes, dark: float, end: float) -> tuple[float, bool]:
 
 def _typical(likelihood: _Codes, dark: float, end: float) -> float:
     """Return about the arrivals of the mean code, to begin at."""
-    sensor, exposure = likelihood.sensor, likelihood.exposure
+    sensor = likelihood.sensor
+    exposure = likelihood.exposure
     light = np.append(dark, np.geomspace(max(dark, 1e-3), max(end, 2e-3), 256))
     mean = np.maximum.accumulate(sensor.moments_of(light, exposure)[0])
     code = likelihood.counts @ likelihood.codes / likelihood.counts.sum()
@@ -124,14 +128,16 @@ def _typical(likelihood: _Codes, dark: float, end: float) -> float:
 def _crossing(likelihood: _Codes, target: float, best: float, limit: float, end: float) -> float:
     """Return where the log-likelihood falls to `target` between `best` and `limit`; the limit if it does not."""
     down = limit < best
-    inner, factor = best, 1.05
+    inner = best
+    factor = 1.05
     while True:
         outer = max(limit, inner / factor) if down else min(inner * factor, max(end, inner))
         if likelihood.value(outer) < target:
             break
         if outer in (limit, inner):
             return limit
-        inner, factor = outer, factor**2
+        inner = outer
+        factor = factor**2
     return _root(lambda x: likelihood.value(x) - target, outer, inner)
 
 

@@ -99,7 +99,8 @@ class ColourFilter:
     def over(self, efficiency: float, height: int, width: int, origin: tuple[int, int] = (0, 0)) -> Array:
         """Return `weights` of every pixel, [3, height, width]; `origin` (y, x) places a crop in the frame."""
         rows, columns = self.tile
-        y, x = (np.arange(height) + origin[0]) % rows, (np.arange(width) + origin[1]) % columns
+        y = (np.arange(height) + origin[0]) % rows
+        x = (np.arange(width) + origin[1]) % columns
         return self.weights(efficiency)[:, y[:, None], x]
 
     def mosaic(self, photons: Array, efficiency: float, origin: tuple[int, int] = (0, 0)) -> Array:
@@ -151,7 +152,8 @@ def from_dict(table: Any, where: str = "colour") -> ColourFilter:
     for key in table:
         if key not in ("mask", "efficiency"):
             raise ValueError(f"{where}: unknown key {key!r}{suggest(key, ('mask', 'efficiency'))}")
-    mask, given = table["mask"], table.get("efficiency")
+    mask = table["mask"]
+    given = table.get("efficiency")
     if isinstance(mask, str):
         if mask not in MASKS:
             raise ValueError(f"{where}: mask is one of {', '.join(MASKS)} or rows of letters, got {mask!r}")

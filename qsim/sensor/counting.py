@@ -106,7 +106,8 @@ class CountingSPAD(SPAD):
         if (paralyzable := self.dead_time_law(exposure)) is not None:
             return paralyzable.log_pmf(arrivals, wanted)
         live = self._live(arrivals, exposure)
-        before, k = np.column_stack([arrivals, live[:, :-1]]), np.arange(self.levels)
+        before = np.column_stack([arrivals, live[:, :-1]])
+        k = np.arange(self.levels)
         at_once = poisson_log_pmf(before, k)
         with np.errstate(divide="ignore"):
             lower = gammainc(k + 1.0, before) - gammainc(k + 1.0, live)
@@ -166,7 +167,9 @@ class CountingSPAD(SPAD):
         check_exposure(exposure)
         if self.bits > MOST_BITS:
             return None
-        dark, count, law = self.dark_rate * exposure, self.levels - 1, self.dead_time_law(exposure)
+        dark = self.dark_rate * exposure
+        count = self.levels - 1
+        law = self.dead_time_law(exposure)
         if law is not None:
             curves = _paralyzable_curves(law, count)
         elif self.bits <= _SUMMED_BITS:
@@ -232,10 +235,13 @@ class CountingSPAD(SPAD):
         from scipy.special import gammainc, gammaincc
 
         below, above = (u.ravel() for u in uniform_pair(*(words(key, photons.shape, origin, n) for n in (0, 1))))
-        arrivals, share = self.arrivals(photons, exposure).ravel(), self.dead_time / exposure
+        arrivals = self.arrivals(photons, exposure).ravel()
+        share = self.dead_time / exposure
 
         def passed(k: Array, left: Array) -> Array:
-            live, u, v = arrivals[left] * np.maximum(1 - k * share, 0), below[left], above[left]
+            live = arrivals[left] * np.maximum(1 - k * share, 0)
+            u = below[left]
+            v = above[left]
             low = u < 0.5
             result = np.empty(len(left), bool)
             result[low] = u[low] >= gammaincc(k[low] + 1, live[low])

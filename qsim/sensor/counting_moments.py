@@ -69,7 +69,8 @@ def summed(mean: Array, around: Array, reach: Array, top: int, tail: Tail) -> tu
     anchor = np.clip(np.rint(around), 0, top).astype(np.int64)
     low = np.clip(np.floor(around - reach), 0, top).astype(np.int64)
     high = np.clip(np.ceil(around + reach), 0, top).astype(np.int64)
-    first, second = np.empty(len(mean)), np.empty(len(mean))
+    first = np.empty(len(mean))
+    second = np.empty(len(mean))
     order = np.argsort(high - low)
     start = 0
     while start < len(order):

@@ -40,7 +40,8 @@ def demosaic(mosaic: Array, filters: ColourFilter, efficiency: float, *, floor: 
         raise ValueError(f"demosaicing: the mask {' '.join(filters.mask)} does not determine three bands")
     kernels = _kernels(weights.tobytes(), rows, columns)
     reach = kernels.shape[-1] // 2
-    y, x = _within(height, rows, reach), _within(width, columns, reach)
+    y = _within(height, rows, reach)
+    x = _within(width, columns, reach)
     padded = np.asarray(mosaic, np.float64)[..., y[:, None], x]
     out = np.empty((*mosaic.shape[:-2], 3, height, width))
     for i, j in np.ndindex(rows, columns):

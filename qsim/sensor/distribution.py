@@ -29,7 +29,9 @@ from qsim.keys import uniform, uniform_pair
 
 _TOGETHER = 1 << 22  # probabilities held at a time
 MOST_EVENTS = 1e15  # expected per exposure; every sensor within the limits of its numbers is saturated by less
-LONGEST, SHORTEST = 1e9, 1e-18  # s, of an exposure
+# s, of an exposure
+LONGEST = 1e9
+SHORTEST = 1e-18
 MANY_BITS = 9  # from which moments are computed from the codes near the mean
 
 
@@ -159,7 +161,8 @@ class Distribution(ABC):
     def dense_moments_of(self, arrivals: Array, exposure: float) -> tuple[Array, Array]:
         """Return mean and variance [...] of the code at arrivals [...], from the probabilities of all codes."""
         codes = np.arange(self.levels, dtype=float)
-        mean, variance = np.empty(len(arrivals)), np.empty(len(arrivals))
+        mean = np.empty(len(arrivals))
+        variance = np.empty(len(arrivals))
         step = max(1, _TOGETHER // self.levels)
         for start in range(0, len(arrivals), step):
             some = slice(start, start + step)
@@ -210,14 +213,16 @@ class Distribution(ABC):
 
         The photons broadcast to the shape of the numbers.
         """
-        cdf, u = self.cdf(photons, exposure)[..., :-1], u[..., None]
+        cdf = self.cdf(photons, exposure)[..., :-1]
+        u = u[..., None]
         return np.count_nonzero(u >= cdf, axis=-1), (np.abs(u - cdf) <= 2.0**-32).any(axis=-1)
 
     def codes_at(self, first: Array, second: Array, photons: Array, exposure: float) -> Array:
         """Return codes [p] of two words uint32 [p] each: a 64-bit number, compared from the nearer end."""
         below, above = (u[:, None] for u in uniform_pair(first, second))
         pmf = self.pmf(photons, exposure)
-        cdf, survival = np.cumsum(pmf, axis=1)[:, :-1], np.cumsum(pmf[:, :0:-1], axis=1)[:, ::-1]
+        cdf = np.cumsum(pmf, axis=1)[:, :-1]
+        survival = np.cumsum(pmf[:, :0:-1], axis=1)[:, ::-1]
         return np.count_nonzero(np.where(below < 0.5, below >= cdf, above <= survival), axis=1)
 
 

@@ -18,7 +18,9 @@ from numpy import ndarray as Array
 from qsim.sensor import code_likelihood
 from qsim.sensor.distribution import Distribution
 
-_DECADES, _PER_DECADE = 8, 128  # of the grid: linear interpolation between its points is good to 4e-5
+# of the grid: linear interpolation between its points is good to 4e-5
+_DECADES = 8
+_PER_DECADE = 128
 _FLAT = 1e-14  # change of the cdf per doubling of light, below which a sensor counts as saturated
 _DOUBLINGS = 44  # of light: within these a sensor saturates, or its mean code stops rising
 _NEVER = -1e290  # replaces log 0 where it may be multiplied by 0
@@ -87,7 +89,8 @@ class _Grid:
 
 @lru_cache(maxsize=32)
 def _grid(sensor: Distribution, exposure: float) -> _Grid:
-    end, brightest = sensor.white(exposure), sensor.brightest(exposure)
+    end = sensor.white(exposure)
+    brightest = sensor.brightest(exposure)
     if brightest <= 0:
         raise ValueError(_TOO_DARK.format(type(sensor).__name__))
     dark = sensor.cdf(np.array([0.0]), exposure)
@@ -111,12 +114,14 @@ def _end_of_rise(sensor: Distribution, exposure: float) -> float:
 
     `ValueError` for a sensor whose mean code does not rise from darkness.
     """
-    top, limit = sensor.levels - 1, sensor.brightest(exposure)
+    top = sensor.levels - 1
+    limit = sensor.brightest(exposure)
 
     def mean_at(photons: float) -> float:
         return float(sensor.mean(np.array([photons]), exposure)[0])
 
-    dark, photons = mean_at(0.0), sensor.white(exposure) / 16
+    dark = mean_at(0.0)
+    photons = sensor.white(exposure) / 16
     here = mean_at(photons) if photons < limit else dark
     for _ in range(_DOUBLINGS):  # one by one: the brightest light takes the longest tables
         if 2 * photons >= limit:
@@ -129,7 +134,8 @@ def _end_of_rise(sensor: Distribution, exposure: float) -> float:
             if here > dark:
                 return photons
             break
-        photons, here = 2 * photons, there
+        photons = 2 * photons
+        here = there
     raise ValueError(f"{sensor}: its mean code is {dark:.4g} in the dark and does not rise with light")
 
 
@@ -159,7 +165,8 @@ def maximum_likelihood(sensor: Distribution, histogram: Array, exposure: float, 
         return _one_by_one(sensor, counts, exposure, confidence)
     _refuse_impossible(sensor, exposure, counts)
     distinct, where = np.unique(counts.reshape(-1, sensor.levels), axis=0, return_inverse=True)
-    grid, parts = _grid(sensor, exposure), []
+    grid = _grid(sensor, exposure)
+    parts = []
     for start in range(0, len(distinct), _CHUNK):
         likelihood = _Likelihood(sensor, exposure, distinct[start : start + _CHUNK])
         parts.append(_estimate(likelihood, grid, confidence))
@@ -236,7 +243,9 @@ class _Likelihood:
 def _estimate(likelihood: _Likelihood, grid: _Grid, confidence: float) -> Array:
     """Return photons, lower and upper of every histogram: [3, h]."""
     table = likelihood.counts @ grid.log_pmf.T
-    best, end, everything = table.argmax(axis=1), len(grid.photons) - 1, np.arange(len(table))
+    best = table.argmax(axis=1)
+    end = len(grid.photons) - 1
+    everything = np.arange(len(table))
     if grid.saturates:
         bright = table[:, end] >= table.max(axis=1) - 1e-6
     else:
@@ -262,7 +271,8 @@ def _crossing(likelihood: _Likelihood, grid: _Grid, table: Array, start: Array, 
 
     It is 0 or infinity if the likelihood does not fall that far.
     """
-    photons, size = grid.photons, len(grid.photons)
+    photons = grid.photons
+    size = len(grid.photons)
     low_enough = table < target[:, None]
     if direction < 0:
         there = low_enough & (photons <= start[:, None])

@@ -34,7 +34,9 @@ from qsim.sensor.defects.fixed_pattern import DarkSpread
 KEYS = ("median", "dark_doubling", "dark_reference", "temperature", "qe_curve")
 DARK = {"QIS": "dark_current", "SpikeCamera": "dark_current"}  # of other models: dark_count_rate
 EFFICIENCY = {"QIS": "quantum_efficiency", "SpikeCamera": "quantum_efficiency"}  # of other models: pde
-COLDEST, HOTTEST = -273.15, 300.0  # degrees C
+# degrees C
+COLDEST = -273.15
+HOTTEST = 300.0
 WAVELENGTH = 550e-9  # m, where no clip states another: that of cameras
 
 
@@ -54,7 +56,8 @@ def resolved(table: Mapping[str, Any], where: str, conditions: Conditions = NOTH
     """Return a table [sensor] without these laws, its dark rate and efficiency as they give them; `ValueError`."""
     plain = {key: value for key, value in table.items() if key not in KEYS}
     model = table.get("model")
-    dark, efficiency = DARK.get(str(model), "dark_count_rate"), EFFICIENCY.get(str(model), "pde")
+    dark = DARK.get(str(model), "dark_count_rate")
+    efficiency = EFFICIENCY.get(str(model), "pde")
     if "median" in table:
         if dark in table:
             raise ValueError(f"{where}: {dark} (a mean) and median state the dark rate twice; leave one out")
@@ -78,8 +81,10 @@ def dark_factor(table: Mapping[str, Any], where: str, temperature: float | None 
             if key in table:
                 raise ValueError(f"{where}: {key} needs dark_doubling, the kelvin per doubling of the dark rate")
         if temperature is not None:
-            raise ValueError(f"{where}: has no law of temperature; give it dark_doubling and dark_reference, or leave "
-                             "the temperature out")  # fmt: skip
+            raise ValueError(
+                f"{where}: has no law of temperature; give it dark_doubling and dark_reference, or leave "
+                "the temperature out"
+            )
         return 1.0
     if "dark_reference" not in table:
         raise ValueError(f"{where}: dark_doubling needs dark_reference, the degrees C of the stated dark rate")

@@ -83,7 +83,8 @@ class Paralyzable:
         """
         if not self.by_steps or self.possible < MANY:
             law = self if self.possible == self.levels else Paralyzable(self.ratio, self.possible)
-            codes, nothing = np.arange(self.possible), np.zeros((len(mean), self.possible), bool)
+            codes = np.arange(self.possible)
+            nothing = np.zeros((len(mean), self.possible), bool)
             pmf = np.exp(law.log_pmf(mean, nothing))
             first = pmf @ codes
             return first, np.sum(pmf * (codes - first[:, None]) ** 2, axis=1)
@@ -171,7 +172,8 @@ def _log_counts(ratio: float, counted: int, last: int) -> Array:
     from scipy.special import gammaln
 
     log_shares = _log_shares(ratio, counted, last)
-    n, k = np.arange(last)[:, None], np.arange(counted + 1)[None, :]
+    n = np.arange(last)[:, None]
+    k = np.arange(counted + 1)[None, :]
     with np.errstate(divide="ignore", invalid="ignore"):
         log_choices = gammaln(n) - gammaln(k) - gammaln(n - k + 1)
         log_length = np.log1p(-np.minimum((k - 1) / ratio, 1.0))
@@ -270,7 +272,8 @@ class _Paralysed:
         """Return the series of P(N > k), or of its derivative, for every code below the last: [p, levels]."""
         from scipy.special import binom
 
-        terms, result = moments * self.rate[:, None] ** (self.j - 1), np.zeros((len(self.mean), self.levels))
+        terms = moments * self.rate[:, None] ** (self.j - 1)
+        result = np.zeros((len(self.mean), self.levels))
         for k in range(min(self.levels - 1, len(self.j))):
             result[:, k] = terms @ np.where(self.j > k, (-1.0) ** (self.j - k - 1) * binom(self.j - 1, k), 0.0)
         return result
@@ -281,15 +284,20 @@ def _moments(mean: Array, a: float, last: int) -> tuple[Array, Array]:
 
     Both are [p, last], j = 1 ... last.
     """
-    moments, slopes = np.empty((len(mean), last)), np.empty((len(mean), last))
+    moments = np.empty((len(mean), last))
+    slopes = np.empty((len(mean), last))
     factor = np.exp(-mean * a)
     for j in range(1, last + 1):
         c = 1 - (j - 1) * a
         end = min(a, c)
-        rest, fade = c - end, np.exp(-mean * end)
-        before, integral = np.zeros_like(mean), -np.expm1(-mean * end)  # J(r - 1), J(r), here r = 0
+        rest = c - end
+        fade = np.exp(-mean * end)
+        # J(r - 1), J(r), here r = 0
+        before = np.zeros_like(mean)
+        integral = -np.expm1(-mean * end)
         for r in range(1, j):
-            before, integral = integral, (c**r - fade * rest**r) / gamma(r + 1) - integral / mean
+            before = integral
+            integral = (c**r - fade * rest**r) / gamma(r + 1) - integral / mean
         open_end = rest**j / gamma(j + 1)
         moments[:, j - 1] = integral + mean * factor * open_end
         slopes[:, j - 1] = (c * before - (j - 1) * integral) / mean + fade * end * rest ** (j - 1) / gamma(j)

@@ -51,10 +51,12 @@ class Circle:
 
     def sums(self, codes: Array, some: Array) -> Array:
         """Return F_k inside of |z| = 1, F_k - 1 outside, of `codes` [n] of the pixels `some` int [n]: [n]."""
-        inside, away = self.inside[some], (codes - self.first[some]) / self.deviation[some]
+        inside = self.inside[some]
+        away = (codes - self.first[some]) / self.deviation[some]
         result = np.where(inside, away > 0, -1.0 * (away < 0))  # far away
         close = np.where(inside, (away > -_FAR) & (away < _OTHER), (away > -_OTHER) & (away < _FAR))
-        k, at = codes[close], some[close]
+        k = codes[close]
+        at = some[close]
         z = self.factor[:, at] * np.exp(self.power[:, at] - k * self.log_z[:, at])
         result[close] = z.real.sum(axis=0) + np.where(inside[close], self.turn[at], -self.turn[at])
         return result
@@ -68,7 +70,8 @@ def generating(log_z: Array, mean: Array, ratio: float) -> tuple[Array, Array, A
     """
     from scipy.special import lambertw
 
-    a, less = 1 / ratio, np.expm1(log_z)
+    a = 1 / ratio
+    less = np.expm1(log_z)
     w = lambertw(mean * a * np.exp(-mean * a) * less)
     share = 1 + less * np.exp(-mean * a - w)
     change = (share - 1) * (1 - mean * a) / (1 + w)  # ds/dmean
@@ -107,7 +110,8 @@ def decide(ratio: float, top: int, below: Array, above: Array, mean: Array) -> t
     z = normal(below, above)
     skew = third / np.maximum(variance, 1e-9)
     guess = np.rint(first + np.sqrt(variance) * z + skew * (z * z - 1) / 6)
-    codes, near = np.empty(len(mean), np.intp), np.full(len(mean), np.inf)
+    codes = np.empty(len(mean), np.intp)
+    near = np.full(len(mean), np.inf)
     order = np.argsort(variance)  # pixels of one block have as many nodes
     for start in range(0, len(mean), _BLOCK):
         block = order[start : start + _BLOCK]
@@ -116,7 +120,8 @@ def decide(ratio: float, top: int, below: Array, above: Array, mean: Array) -> t
 
 
 def _block(ratio: float, top: int, below: Array, above: Array, mean: Array, guess: Array) -> tuple[Array, Array]:
-    near, inside = np.full(len(mean), np.inf), below < 0.5
+    near = np.full(len(mean), np.inf)
+    inside = below < 0.5
     nodes = circle(mean, inside, ratio)
 
     def passed(k: Array, left: Array) -> Array:

@@ -31,7 +31,8 @@ def poisson_log_pmf(mean: Array, n: Array) -> Array:
     """
     from scipy.special import gammaln, xlog1py, xlogy
 
-    mean, n = np.asarray(mean, float), np.asarray(n, float)
+    mean = np.asarray(mean, float)
+    n = np.asarray(n, float)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         excess = (n - mean) / mean
         deviance = mean * (xlog1py(1 + excess, excess) - excess)
@@ -64,18 +65,24 @@ def poisson_quantile(mean: Array, below: Array, above: Array) -> Array:
 
     z = normal(below, above)
     guess = np.maximum(np.floor(mean + np.sqrt(mean) * z + (z * z - 1) / 6), 0.0)
-    low, high, step = guess - 1, guess, 1.0  # wanted: not enough(low), enough(high)
+    # wanted: not enough(low), enough(high)
+    low = guess - 1
+    high = guess
+    step = 1.0
     while (missing := ~enough(high)).any():
-        low, high = np.where(missing, high, low), np.where(missing, high + step, high)
+        low = np.where(missing, high, low)
+        high = np.where(missing, high + step, high)
         step *= 2
     step = 1.0
     while (excess := enough(low)).any():
-        high, low = np.where(excess, low, high), np.where(excess, np.maximum(low - step, -1.0), low)
+        high = np.where(excess, low, high)
+        low = np.where(excess, np.maximum(low - step, -1.0), low)
         step *= 2
     while (high - low > 1).any():
         middle = np.floor((low + high) / 2)
         good = enough(middle)
-        low, high = np.where(good, low, middle), np.where(good, middle, high)
+        low = np.where(good, low, middle)
+        high = np.where(good, middle, high)
     return high
 
 

@@ -28,7 +28,9 @@ from qsim.sensor.qis_steps import NOISY, BlurredSteps, Thresholds, decide
 from qsim.sensor.sensor import Sensor
 
 _REACH = 39.0  # sigmas: Phi(-39) = 1e-333 is 0 in float64
-_BLOCK, _SPAN = 256, 4096  # most levels, and electrons between them, that share one table
+# most levels, and electrons between them, that share one table
+_BLOCK = 256
+_SPAN = 4096
 _LONG = 1 << 13  # electrons of a table x (codes + 32); above it, few steps are computed one by one
 _LONGEST_TABLE = 2048  # electrons in a table that short sums are made of
 _BLUR = 8.3  # sigmas: 1 - Phi(8.3) = 5e-17 is negligible beside 1
@@ -108,7 +110,8 @@ class QIS(Sensor):
         return qis_moments.moments(self, arrivals)
 
     def code_laws(self, codes: Array, arrivals: float, exposure: float) -> tuple[Array, Array]:
-        chain, found = qis_moments.Chain.of(self), []
+        chain = qis_moments.Chain.of(self)
+        found = []
         for code in codes.tolist():
 
             def chance(electrons: Array, code: int = code) -> Array:
@@ -142,7 +145,8 @@ class QIS(Sensor):
         if steps is None:
             return super().decide(u, photons, exposure)
         mean = self.arrivals(photons, exposure).ravel()
-        variance, z = mean + self.read_noise**2, ndtri(u.ravel())
+        variance = mean + self.read_noise**2
+        z = ndtri(u.ravel())
         skew = np.divide(mean, variance, out=np.zeros_like(mean), where=variance > 0) * (z * z - 1) / 6
         electrons = mean + z * np.sqrt(variance) + skew
         if self.full_well is not None:
@@ -155,7 +159,8 @@ class QIS(Sensor):
         """Return a plan of short sums over electrons, or of curves where those are too long."""
         if self.bits > MOST_BITS:
             return None
-        dark, count = self.dark_rate * exposure, self.levels - 1
+        dark = self.dark_rate * exposure
+        count = self.levels - 1
         if (sums := self.short_sums()) is not None:
             return Plan.summed(self.efficiency, dark, sums)
         steps: Thresholds | BlurredSteps | None = self._blurred_steps() or thresholds(self)
@@ -221,7 +226,8 @@ class QIS(Sensor):
         shift = np.broadcast_to(offset / self.gain, mean.shape)
         steps = (np.arange(self.levels - 1) + 0.5 - self.offset) / self.gain
         last = int(np.ceil(pdtrik(1 - 1e-12, max(float(mean.max()), 1e-6)))) + 1
-        below, cdf = np.zeros_like(mean), np.zeros((*mean.shape, self.levels))
+        below = np.zeros_like(mean)
+        cdf = np.zeros((*mean.shape, self.levels))
         for n in range(last + 1):
             up_to = pdtr(n, mean) if n < last else np.ones_like(mean)
             electrons = n if self.full_well is None else min(n, self.full_well)
@@ -249,8 +255,10 @@ def thresholds(sensor: QIS) -> Thresholds | None:
     """
     from scipy.special import ndtr
 
-    top, noise = sensor.levels - 1, sensor.read_noise
-    codes, well = np.arange(top), inf if sensor.full_well is None else sensor.full_well
+    top = sensor.levels - 1
+    noise = sensor.read_noise
+    codes = np.arange(top)
+    well = inf if sensor.full_well is None else sensor.full_well
     at = (codes + 0.5 - sensor.offset) / sensor.gain  # electrons
     width = ceil(2 * _BLUR * noise) + 1 if noise else 0
     if top * width > _WIDEST:
@@ -283,7 +291,8 @@ def electron_table(sensor: QIS, start: int, stop: int) -> Mixture:
     saturated = well if last >= well else inf  # electrons of all n >= last
     electrons = np.append(np.arange(first, last, dtype=float), saturated)
     z = _normal_thresholds(sensor, electrons, np.arange(start - 1, stop))
-    cdf, log_pmf = ndtr(z[:, 1:]), log_normal_difference(z[:, :-1], z[:, 1:])
+    cdf = ndtr(z[:, 1:])
+    log_pmf = log_normal_difference(z[:, :-1], z[:, 1:])
     slope = -np.exp(log_normal_difference(z[1:, 1:], z[:-1, 1:]))
     return Mixture(first, cdf[:-1], log_pmf[:-1], slope, cdf[-1], log_pmf[-1])
 
@@ -304,7 +313,8 @@ def log_normal_difference(low: Array, high: Array) -> Array:
     flip = low > 0  # Phi(b) - Phi(a) = Phi(-a) - Phi(-b): work on the side where both are small
     low, high = np.where(flip, -high, low), np.where(flip, -low, high)
     with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = log_ndtr(low), log_ndtr(high)
+        a = log_ndtr(low)
+        b = log_ndtr(high)
         one_side = b + np.log1p(-np.exp(a - b))
         astride = np.log((erf(high / np.sqrt(2)) + erf(-low / np.sqrt(2))) / 2)
     return np.where(low == high, -inf, np.where(high > 0, astride, one_side))

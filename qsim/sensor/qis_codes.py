@@ -38,27 +38,32 @@ def code_law(chain: Chain, code: int, mean: float, chance: Callable[[Array], Arr
     `chance` returns log P(code | n) of electrons [n].
     """
     low, high = _interval(chain, code)
-    root, variance = np.sqrt(mean), mean + chain.noise**2
+    root = np.sqrt(mean)
+    variance = mean + chain.noise**2
     nearest = min(max(mean, low), high)
     likeliest = mean + (nearest - mean) * mean / variance
     reach = SIGMAS * (root * chain.noise + mean) / np.sqrt(variance) + LONGER
     first = floor(max(likeliest - reach, low - FARTHEST * chain.noise - 1, 0.0))
     last = ceil(max(min(likeliest + reach, high + FARTHEST * chain.noise + 1), first))
     step = max(1, floor(0.5 * chain.noise * root / (chain.noise + root))) if chain.noise else 1
-    parts, blurred = [], SIGMAS * chain.noise + 1
+    parts = []
+    blurred = SIGMAS * chain.noise + 1
     cut = last - first > step * 2 * blurred
     if last >= chain.well:
         edge = ceil(chain.well)
         parts.append(_above(edge, mean, float(chance(np.array([chain.well]))[0])))
-        last, step = edge - 1, 1
+        last = edge - 1
+        step = 1
     elif cut and high == MOST and last > low + blurred:
         edge = max(ceil(low + blurred), first)
         parts.append(_above(edge, mean, 0.0))
-        last, step = edge - 1, 1
+        last = edge - 1
+        step = 1
     if cut and low == -MOST and first < high - blurred:
         edge = min(floor(high - blurred), last)
         parts.append(_below(edge, mean))
-        first, step = edge + 1, 1
+        first = edge + 1
+        step = 1
     n = np.arange(first, last + 1, step, dtype=float)
     if len(n):
         parts.append(_Part(poisson_log_pmf(np.array(mean), n) + chance(n) + log(step), n))

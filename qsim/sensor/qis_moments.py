@@ -87,7 +87,8 @@ def moments(sensor: Converter, mean: Array) -> tuple[Array, Array]:
     least, most = window(mean)
     low = chain.level(least) - SIGMAS * chain.blur
     high = chain.level(most) + SIGMAS * chain.blur
-    first, second = np.zeros(len(mean)), np.zeros(len(mean))
+    first = np.zeros(len(mean))
+    second = np.zeros(len(mean))
     first[low > chain.top - 0.5] = chain.top
     full = least >= chain.well
     if full.any():
@@ -129,7 +130,8 @@ def _by_series(chain: Chain, mean: Array) -> tuple[Array, Array]:
     saw, product, square = (np.zeros(len(mean)) for _ in range(3))
     for j in range(1, ceil(terms.max()) + 1):
         some = np.flatnonzero(terms >= j - 1)
-        t, light = 2 * pi * j, mean[some]
+        t = 2 * pi * j
+        light = mean[some]
         angle, turn = (2 * pi * (value - np.rint(value)) for value in (j * chain.gain, j * chain.offset))
         change = complex(-2 * np.sin(angle / 2) ** 2, np.sin(angle))  # exp(i t gain) - 1
         size = np.exp(light * change.real - (t * chain.blur) ** 2 / 2)
@@ -153,7 +155,8 @@ def _by_thresholds(chain: Chain, mean: Array) -> tuple[Array, Array]:
     shifts = _shifts(chain, codes, places)
     base = chain.gain * mean + chain.offset
     starts, stops = (np.searchsorted(places, mean + side * SIGMAS * np.sqrt(mean)) for side in (-1, 1))
-    first, second = np.empty(len(mean)), np.empty(len(mean))
+    first = np.empty(len(mean))
+    second = np.empty(len(mean))
     for i, light in enumerate(mean):
         some = slice(starts[i], stops[i])
         x = places[some]
@@ -199,7 +202,8 @@ def _summed(chain: Chain, mean: Array) -> tuple[Array, Array]:
     """Return the moments of the code from those of n electrons, weighted by their probabilities."""
     from scipy.special import gammaln
 
-    first, second = np.empty(len(mean)), np.empty(len(mean))
+    first = np.empty(len(mean))
+    second = np.empty(len(mean))
     for levels, n in shared_tables(chain, mean):
         codes, spread = given(chain, n)
         middle = codes[len(codes) // 2]
@@ -207,7 +211,8 @@ def _summed(chain: Chain, mean: Array) -> tuple[Array, Array]:
         table = np.stack([np.ones(len(n)), away, spread + away**2])
         log_factorial = gammaln(n + 1) if n[-1] < TABLED else None
         least, most = window(mean[levels])
-        starts, stops = np.searchsorted(n, least), np.searchsorted(n, most, "right")
+        starts = np.searchsorted(n, least)
+        stops = np.searchsorted(n, most, "right")
         for i, start, stop in zip(levels, starts, stops, strict=True):
             some = slice(start, stop)
             if log_factorial is None or mean[i] == 0:
@@ -252,16 +257,20 @@ def shared_tables(chain: Chain, mean: Array) -> Iterator[tuple[Array, Array]]:
 
 def given(chain: Chain, electrons: Array) -> tuple[Array, Array]:
     """Return mean and variance of the code of n electrons [n]: [n] each."""
-    x, blur, top = chain.level(electrons), chain.blur, chain.top
+    x = chain.level(electrons)
+    blur = chain.blur
+    top = chain.top
     if blur == 0:
         return np.clip(np.rint(x), 0, top), np.zeros(len(x))
     if blur < FINE:
-        codes, spread = np.clip(np.rint(x), 0, top), np.zeros(len(x))
+        codes = np.clip(np.rint(x), 0, top)
+        spread = np.zeros(len(x))
         near = np.abs(x - np.rint(x)) > 0.5 - SIGMAS * blur
         codes[near], spread[near] = _counted(x[near], blur, top)
         return codes, spread
     near = (x < SIGMAS * blur) | (x > top - SIGMAS * blur)
-    codes, spread = x.copy(), np.full(len(x), blur**2 + 1 / 12)
+    codes = x.copy()
+    spread = np.full(len(x), blur**2 + 1 / 12)
     if blur >= WIDE:
         codes[near], spread[near] = _wide(x[near], blur, top)
         return codes, spread
@@ -278,7 +287,8 @@ def _rounded(x: Array, blur: float) -> tuple[Array, Array]:
     for j in range(1, ceil(np.sqrt(NEGLIGIBLE / 2) / (pi * blur)) + 1):
         t = 2 * pi * j
         size = (-1) ** (j + 1) / (pi * j) * np.exp(-((t * blur) ** 2) / 2)
-        sine, cosine = size * np.sin(t * x), size * np.cos(t * x)
+        sine = size * np.sin(t * x)
+        cosine = size * np.cos(t * x)
         saw += sine
         product += t * blur**2 * cosine
         square -= cosine / (pi * j)
@@ -291,7 +301,8 @@ def _counted(x: Array, blur: float, top: int) -> tuple[Array, Array]:
 
     anchor = np.clip(np.rint(x), 0, top)  # small probabilities are summed on either side of it
     lowest = np.floor(x - SIGMAS * blur)
-    first, second = np.zeros(len(x)), np.zeros(len(x))
+    first = np.zeros(len(x))
+    second = np.zeros(len(x))
     for j in range(ceil(2 * SIGMAS * blur) + 2):
         k = lowest + j
         below = k < anchor
@@ -326,7 +337,8 @@ def _tail(z: Array, blur: float) -> tuple[Array, Array]:
     """
     from scipy.special import ndtr
 
-    tail, density = ndtr(-z), np.exp(-z * z / 2) / np.sqrt(2 * pi)
+    tail = ndtr(-z)
+    density = np.exp(-z * z / 2) / np.sqrt(2 * pi)
     hermite: list[Array] = [
         np.ones(len(z)),
         z,

@@ -36,7 +36,8 @@ class Thresholds:
         from scipy.special import gammainc, gammaincc
 
         def block(k: Array, some: Array) -> Array:
-            first, last = self.first[k], self.first[k] + self.weights.shape[1]
+            first = self.first[k]
+            last = self.first[k] + self.weights.shape[1]
             result = np.where(first > 0, gammaincc(np.maximum(first, 1), some), 0.0) + self._sum(self.weights, k, some)
             if self.tail[k].any():
                 result += self.tail[k] * np.where(last > 0, gammainc(np.maximum(last, 1), some), 1.0)
@@ -65,12 +66,14 @@ class Thresholds:
         reach = 9 * np.sqrt(mean) + 25
         start = np.clip(np.floor(mean - reach) - self.first[k], 0, width).astype(np.intp)
         stop = np.clip(np.ceil(mean + reach) - self.first[k], 0, width).astype(np.intp)
-        total, n = np.zeros(len(mean)), (self.first[k] + start).astype(float)
+        total = np.zeros(len(mean))
+        n = (self.first[k] + start).astype(float)
         steps = int((stop - start).max(initial=0))
         if not steps:
             return total
         flat = np.column_stack([table, np.zeros(len(table))]).ravel()
-        at, end = k * (width + 1) + start, k * (width + 1) + width
+        at = k * (width + 1) + start
+        end = k * (width + 1) + width
         weight = np.exp(poisson_log_pmf(mean, n))
         for _ in range(steps):
             total += weight * flat[at]
@@ -96,7 +99,8 @@ class BlurredSteps:
 
     def slope(self, codes: Array, mean: Array) -> Array:
         """Return dF/dmean of pairs: the change by one more electron."""
-        places, mean = self.places[np.asarray(codes, np.intp)], np.asarray(mean, float)
+        places = self.places[np.asarray(codes, np.intp)]
+        mean = np.asarray(mean, float)
         return self._below(places - 1, mean) - self._below(places, mean)
 
     def _below(self, places: Array, mean: Array) -> Array:
@@ -105,8 +109,11 @@ class BlurredSteps:
         variance = mean + self.noise**2
         x = np.clip((places - mean) / np.sqrt(variance), -40, 40)
         k3, k4, k5 = (mean / variance ** (order / 2) for order in (3, 4, 5))
-        h2, h3, h4 = x**2 - 1, x**3 - 3 * x, x**4 - 6 * x**2 + 3
-        h5, h6 = x**5 - 10 * x**3 + 15 * x, x**6 - 15 * x**4 + 45 * x**2 - 15
+        h2 = x**2 - 1
+        h3 = x**3 - 3 * x
+        h4 = x**4 - 6 * x**2 + 3
+        h5 = x**5 - 10 * x**3 + 15 * x
+        h6 = x**6 - 15 * x**4 + 45 * x**2 - 15
         h8 = x**8 - 28 * x**6 + 210 * x**4 - 420 * x**2 + 105
         series = k3 / 6 * h2 + k4 / 24 * h3 + k3**2 / 72 * h5
         series += k5 / 120 * h4 + k3 * k4 / 144 * h6 + k3**3 / 1296 * h8
@@ -134,23 +141,28 @@ def search(passed: Callable[[Array, Array], Array], top: int, guess: Array) -> A
     `passed`: codes [n] of the pixels int [n] -> bool [n]. The search goes from the guess on in growing strides, then by
     bisection; only undecided pixels are evaluated again.
     """
-    low, high = np.full(len(guess), -1), np.full(len(guess), top)
+    low = np.full(len(guess), -1)
+    high = np.full(len(guess), top)
     probe = np.clip(guess, 0, max(top - 1, 0)).astype(np.intp)
-    left, stride = np.flatnonzero(high - low > 1), 1
+    left = np.flatnonzero(high - low > 1)
+    stride = 1
     while left.size:
         k = probe[left]
         up = passed(k, left)
         low[left], high[left] = np.where(up, k, low[left]), np.where(up, high[left], k)
-        below, above = low[left], high[left]
+        below = low[left]
+        above = high[left]
         probe[left] = np.where(
             up, np.minimum(k + stride, (below + above + 1) // 2), np.maximum(k - stride, (below + above) // 2)
         )
-        left, stride = left[above - below > 1], 2 * stride
+        left = left[above - below > 1]
+        stride = 2 * stride
     return high
 
 
 def _in_blocks(function: Callable[[Array, Array], Array], codes: Array, mean: Array) -> Array:
-    codes, mean = np.asarray(codes, np.intp), np.asarray(mean, float)
+    codes = np.asarray(codes, np.intp)
+    mean = np.asarray(mean, float)
     result = np.empty(len(mean))
     for start in range(0, len(mean), _CHUNK):
         some = slice(start, start + _CHUNK)

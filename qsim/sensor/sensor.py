@@ -140,7 +140,8 @@ class Sensor(Distribution):
         library that knows DLPack stays on its device. `ValueError` for a sensor or machine without a compiled engine.
         """
         photons = plain(photons) if isinstance(photons, np.ndarray) else photons
-        shape, plan = tuple(map(int, photons.shape)), None
+        shape = tuple(map(int, photons.shape))
+        plan = None
         check_exposure(exposure)
         if len(shape) != 3 or not 0 < prod(shape) < 1 << 32 or "float32" not in str(photons.dtype):
             wanted = "photons have the shape [T, H, W] in float32, 1 to 2^32 - 1 of them"

@@ -88,13 +88,15 @@ class BinarySPAD(SPAD):
         """Return log of Binomial(M, p) with p = 1 - exp(-arrivals / M): [p] -> [p, levels]."""
         from scipy.special import xlogy
 
-        k, per_plane = np.arange(self.levels), arrivals[:, None] / self.planes
+        k = np.arange(self.levels)
+        per_plane = arrivals[:, None] / self.planes
         return _log_binomials(self.planes) + xlogy(k, -np.expm1(-per_plane)) - (self.planes - k) * per_plane
 
     def code_laws(self, codes: Array, arrivals: float, exposure: float) -> tuple[Array, Array]:
         from scipy.special import gammaln
 
-        m, per_plane = self.planes, arrivals / self.planes
+        m = self.planes
+        per_plane = arrivals / self.planes
         ways = gammaln(m + 1) - gammaln(codes + 1) - gammaln(m - codes + 1)
         logs = ways + codes * np.log(-np.expm1(-per_plane)) - (m - codes) * per_plane
         return logs, (codes / np.expm1(per_plane) - (m - codes)) / m
@@ -110,7 +112,8 @@ class BinarySPAD(SPAD):
         """Return dF_k/dp dp/darrivals: -M C(M-1, k) p^k (1-p)^(M-1-k) times (1-p) / M."""
         from scipy.special import xlogy
 
-        k, per_plane = np.arange(self.planes), arrivals[:, None] / self.planes
+        k = np.arange(self.planes)
+        per_plane = arrivals[:, None] / self.planes
         log_slope = _log_binomials(self.planes - 1) + xlogy(k, -np.expm1(-per_plane)) - (self.planes - k) * per_plane
         return np.pad(-np.exp(log_slope), ((0, 0), (0, 1)))
 
@@ -158,11 +161,16 @@ class BinarySPAD(SPAD):
         from scipy.special import betainc
 
         below, above = (u.ravel() for u in uniform_pair(*(words(key, photons.shape, origin, n) for n in (0, 1))))
-        m, per_plane = self.planes, self.arrivals(photons, exposure).ravel() / self.planes
-        dark, lit = np.exp(-per_plane), -np.expm1(-per_plane)
+        m = self.planes
+        per_plane = self.arrivals(photons, exposure).ravel() / self.planes
+        dark = np.exp(-per_plane)
+        lit = -np.expm1(-per_plane)
 
         def passed(k: Array, left: Array) -> Array:
-            q, p, u, v = dark[left], lit[left], below[left], above[left]
+            q = dark[left]
+            p = lit[left]
+            u = below[left]
+            v = above[left]
             low = u < 0.5
             tail = betainc(np.where(low, m - k, k + 1.0), np.where(low, k + 1.0, m - k), np.where(low, q, p))
             return np.where(low, u >= tail, v <= tail)
@@ -176,14 +184,16 @@ class BinarySPAD(SPAD):
 
         Error: the rounding of one exponential, 1e-16 in the probability of each plane, at any number of bits.
         """
-        single, m = replace(self, bits=1), self.planes
+        single = replace(self, bits=1)
+        m = self.planes
         codes = np.zeros(photons.shape, self.dtype)
         rows = max(1, _BATCH // max(photons.shape[1] * m, 1))
         for y in range(0, len(photons), rows):
             light = np.asarray(photons[y : y + rows], np.float64) / m
             step = max(1, _BATCH // max(light.size, 1))
             for plane in range(0, m, step):
-                at, place = key.at(key.frame * m + plane), (origin[0] + y, origin[1])
+                at = key.at(key.frame * m + plane)
+                place = (origin[0] + y, origin[1])
                 fired = single.draw_block(light, exposure / m, at, place, planes=min(step, m - plane))
                 codes[y : y + rows] += fired.sum(axis=0, dtype=self.dtype)
         return codes
@@ -192,7 +202,8 @@ class BinarySPAD(SPAD):
         """As every sensor: the sum of the planes, where plane p of frame f is frame f M + p of a 1-bit sensor."""
         if self.bits == 1:
             return super().draw_at(photons, exposure, key=key, at=at)
-        single, m = replace(self, bits=1), self.planes
+        single = replace(self, bits=1)
+        m = self.planes
         first = at * np.array([[m], [1], [1]])
         planes = (first + np.array([[plane], [0], [0]]) for plane in range(m))
         return np.sum([single.draw_at(photons / m, exposure / m, key=key, at=plane) for plane in planes], axis=0)

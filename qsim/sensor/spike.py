@@ -169,10 +169,12 @@ def interval(arrivals: Array, threshold: int) -> tuple[Array, Array]:
     """
     from scipy.special import pdtr
 
-    longer, change = np.full(arrivals.shape, np.inf), np.full(arrivals.shape, -np.inf)
+    longer = np.full(arrivals.shape, np.inf)
+    change = np.full(arrivals.shape, -np.inf)
     reach = threshold + 12 * np.sqrt(threshold) + 60  # electrons after which a pixel has fired, to 1e-16
     bright = arrivals * _TERMS >= reach
-    planes, light = np.arange(1, _TERMS + 1), arrivals[bright, None]
+    planes = np.arange(1, _TERMS + 1)
+    light = arrivals[bright, None]
     longer[bright] = pdtr(threshold - 1, planes * light).sum(axis=1)
     change[bright] = -(planes * np.exp(poisson_log_pmf(planes * light, np.array(threshold - 1)))).sum(axis=1)
     dim = ~bright & (arrivals > 0)

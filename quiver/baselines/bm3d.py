@@ -90,7 +90,8 @@ def dct_matrix() -> Tensor:
 def wavelet_matrix() -> Tensor:
     """Return the periodic biorthogonal 1.5 wavelet transform of a block, rows of unit length: [64, 64 pixels]."""
     low = np.array([3, -3, -22, 22, 128, 128, 22, -22, -3, 3]) / (128 * np.sqrt(2))
-    one, size = np.eye(BLOCK), BLOCK
+    one = np.eye(BLOCK)
+    size = BLOCK
     while size > 1:
         level = np.zeros((size, size))
         for k in range(size // 2):
@@ -153,7 +154,8 @@ def match_blocks(
 ) -> Matches:
     """Return the most similar blocks within the search window of every reference block in one row of tiles."""
     _, across, _, width = table_size(shape)
-    top, jump = tile_row * TILE * STEP, TILE * STEP
+    top = tile_row * TILE * STEP
+    jump = TILE * STEP
     view = strided(table, (across, REACH, REACH, AREA), (jump * AREA, width * AREA, AREA, 1), top * width * AREA)
     candidates = view.reshape(across, REACH * REACH, AREA)
     reference = view[:, RADIUS : -RADIUS or None : STEP, RADIUS : -RADIUS or None : STEP]
@@ -190,7 +192,8 @@ def norms(table: Tensor, shape: tuple[int, ...]) -> Tensor:
 
 def similar_blocks(table: Tensor, shape: tuple[int, ...], stack: int, limit: float) -> list[Tensor]:
     """Return all stacks as positions [n, size], one tensor per size and row of tiles."""
-    norm, found = norms(table, shape), []
+    norm = norms(table, shape)
+    found = []
     for tile_row in range(table_size(shape)[0]):
         matches = match_blocks(table, norm, tile_row, shape, stack, limit)
         for size in np.unique(matches.size).tolist():
@@ -200,7 +203,8 @@ def similar_blocks(table: Tensor, shape: tuple[int, ...], stack: int, limit: flo
 
 def threshold_step(table: Tensor, shape: tuple[int, ...], sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
     """Return sums of weighted rows [positions, 64] after hard thresholding, and of their weights [positions]."""
-    total, weights = xp.zeros_like(table), zeros(len(table))
+    total = xp.zeros_like(table)
+    weights = zeros(len(table))
     to_wavelet = wavelet_matrix() @ dct_matrix().T
     wavelets = table @ to_wavelet.T
     for position in similar_blocks(table, shape, profile.stack, profile.limit + 2 * sigma**2):
@@ -216,7 +220,8 @@ def threshold_step(table: Tensor, shape: tuple[int, ...], sigma: float, profile:
 
 def wiener_step(table: Tensor, basic: Tensor, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
     """Return the same sums after an empirical Wiener filter, whose spectrum comes from the basic estimate."""
-    total, weights = xp.zeros_like(table), zeros(len(table))
+    total = xp.zeros_like(table)
+    weights = zeros(len(table))
     pilot_table = block_table(basic)
     for position in similar_blocks(pilot_table, basic.shape, profile.second_stack, profile.second_limit):
         haar = haar_matrix(position.shape[1])

@@ -150,7 +150,8 @@ def _log_pmf(shares: tuple[float, ...], sensor: Sensor, exposure: float) -> Arra
 
     `ValueError` if it takes more than TABLE_BYTES.
     """
-    light, codes = levels(shares, sensor, exposure), sensor.levels
+    light = levels(shares, sensor, exposure)
+    codes = sensor.levels
     size = table_bytes(shares, sensor, exposure)
     if size > TABLE_BYTES:
         raise ValueError(

@@ -128,14 +128,16 @@ def second_order(sensor: Sensor, exposure: float, times: Times) -> tuple[Array, 
     definition of residuals", 1968), cut off at one standard deviation.
     """
     light = np.append(0.0, levels(tuple(share for share, _ in times), sensor, exposure)[::COARSE])
-    above, information = np.zeros_like(light), np.zeros_like(light)
+    above = np.zeros_like(light)
+    information = np.zeros_like(light)
     for share, count in times:
         slope, bend, chance = _slopes(sensor, exposure * share, light * share)
         weight = np.divide(slope, chance, out=np.zeros_like(slope), where=chance > 1e-12)
         above += count * share**3 * (weight * bend).sum(axis=-1)
         information += count * share**2 * (weight * slope).sum(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        bias, most = -above / (2 * information**2), 1 / np.sqrt(information)
+        bias = -above / (2 * information**2)
+        most = 1 / np.sqrt(information)
     bias[0] = 0.0  # in the dark a step of scoring is unbiased
     return light, np.where(information > 0, np.clip(bias, -most, most), 0.0)
 
@@ -170,7 +172,8 @@ def _slopes(sensor: Sensor, exposure: float, light: Array) -> tuple[Array, Array
 def _response(sensor: Sensor, exposure: float, times: Times) -> tuple[Array, Array, Array]:
     """Return levels of light from 0 on, and mean and variance of the sum of a window's codes, where the mean rises."""
     light = np.append(0.0, levels(tuple(share for share, _ in times), sensor, exposure))
-    mean, variance = np.zeros_like(light), np.zeros_like(light)
+    mean = np.zeros_like(light)
+    variance = np.zeros_like(light)
     for share, count in times:
         parts = pieces(light * share, sensor.levels)
         mean += count * np.concatenate([sensor.mean(part, exposure * share) for part in parts])

@@ -38,7 +38,8 @@ def restore(
     Below the codes of a dark pixel it is negative, so that noise adds no light.
     `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
     """
-    dark, step = dark_codes(sensor, exposure), sensor.white(exposure) / (sensor.levels - 1)
+    dark = dark_codes(sensor, exposure)
+    step = sensor.white(exposure) / (sensor.levels - 1)
 
     def table_of(count: int) -> Array:
         return (np.arange(count * (sensor.levels - 1) + 1) / count - dark) * step

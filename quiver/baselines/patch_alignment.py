@@ -52,7 +52,8 @@ def pyramid(image: Tensor, levels: tuple[Level, ...] = LEVELS) -> list[Tensor]:
     """Return box means of an image [H, W] with sides that are multiples of 64, finest first."""
     images = [image]
     for level in levels[1:]:
-        fine, step = images[-1], level.ratio
+        fine = images[-1]
+        step = level.ratio
         images.append(sum((fine[y::step, x::step] for y in range(step) for x in range(step)), zeros(1)) / step**2)
     return images
 
@@ -79,17 +80,21 @@ def search(patches: Tensor, other: Tensor, corner: Tensor, centre: Tensor, radiu
     Only shifts that keep the patch inside the image count; among equals the first in raster order. Sums of few-bit
     codes are often equal, and rounding, which differs between machines, must not choose.
     """
-    size, limit = patches.shape[0], xp.asarray(other.shape)[:, None]
-    low, high = -corner, limit - patches.shape[0] - corner
+    size = patches.shape[0]
+    limit = xp.asarray(other.shape)[:, None]
+    low = -corner
+    high = limit - patches.shape[0] - corner
     centre = xp.maximum(xp.minimum(centre, high + radius), low - radius)
     window = gather(other, corner + centre - radius, size + 2 * radius)
-    best, least = centre, xp.full(corner.shape[1:], xp.inf, dtype=xp.float32)
+    best = centre
+    least = xp.full(corner.shape[1:], xp.inf, dtype=xp.float32)
     for v in range(2 * radius + 1):
         for u in range(2 * radius + 1):
             shift = centre + xp.asarray([[v - radius], [u - radius]])
             cost = xp.abs(window[v : v + size, u : u + size] - patches).sum((0, 1))
             better = (cost < least - TIE * size**2) & ((shift >= low) & (shift <= high)).all(0)
-            best, least = xp.where(better, shift, best), xp.where(better, cost, least)
+            best = xp.where(better, shift, best)
+            least = xp.where(better, cost, least)
     return best, least
 
 
@@ -116,7 +121,8 @@ def sample_cubic(image: Tensor, position: Tensor, size: int) -> Tensor:
     """Return bicubic patches [size, size, N] with upper left corners at real positions [2, N]."""
     floor = xp.floor(position)
     square = gather(image, whole(floor) - 1, size + 3)
-    y, x = cubic_weights(position[0] - floor[0]), cubic_weights(position[1] - floor[1])
+    y = cubic_weights(position[0] - floor[0])
+    x = cubic_weights(position[1] - floor[1])
     zero = zeros(1)
     rows = sum((y[k] * square[k : k + size] for k in range(4)), zero)
     return sum((x[k] * rows[:, k : k + size] for k in range(4)), zero)
@@ -144,7 +150,8 @@ def lucas_kanade(reference: Tensor, other: Tensor, corner: Tensor, shift: Tensor
     The gradient is the mean of both images'. Steps are at most one pixel long; a patch without structure in two
     directions is not moved.
     """
-    template, flats = gather(reference, corner, size), derivatives(other)
+    template = gather(reference, corner, size)
+    flats = derivatives(other)
     slopes = [gather(image, corner, size) for image in derivatives(reference)]
     shift = single(shift)
     moving = xp.ones(corner.shape[1:], dtype=xp.bool)
@@ -181,7 +188,8 @@ def align(reference: list[Tensor], other: list[Tensor], *, refine_finest: bool =
     """Return shifts [2, N] of the finest level's patches between two pyramids; integers (as floats) unless refined."""
     shifts = zeros(2, 1, 1)
     for depth in range(len(LEVELS) - 1, -1, -1):
-        level, image = LEVELS[depth], reference[depth]
+        level = LEVELS[depth]
+        image = reference[depth]
         corner, down, across = grid(image.shape, level)
         patches = gather(image, corner, level.patch)
         if depth == len(LEVELS) - 1:
@@ -192,7 +200,8 @@ def align(reference: list[Tensor], other: list[Tensor], *, refine_finest: bool =
         for start in starts[1:]:
             shift, cost = search(patches, other[depth], corner, start, level.radius)
             better = cost < least - TIE * level.patch**2
-            found, least = xp.where(better, shift, found), xp.where(better, cost, least)
+            found = xp.where(better, shift, found)
+            least = xp.where(better, cost, least)
         fine = single(found)
         if level.refine or (depth == 0 and refine_finest):
             fine = lucas_kanade(image, other[depth], corner, fine, level.patch)

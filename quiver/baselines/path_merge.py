@@ -95,9 +95,14 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
         counts = torch.stack([inside[group].sum(0) for group in groups])
         sums = torch.stack([(moved[group] * inside[group]).sum(0) for group in groups])
         return Merged(
-            *_weighted(moved, weight), alone, *_weighted(moved[near], weight[near]), still.numpy(), frames=len(window),
-            groups=(sums / counts.clamp(min=1)).numpy(), group_counts=counts.numpy(),
-        )  # fmt: skip
+            *_weighted(moved, weight),
+            alone,
+            *_weighted(moved[near], weight[near]),
+            still.numpy(),
+            frames=len(window),
+            groups=(sums / counts.clamp(min=1)).numpy(),
+            group_counts=counts.numpy(),
+        )
 
 
 def variance_of(mean_code: Tensor, domain: InformationDomain) -> Tensor:
@@ -158,7 +163,8 @@ def stream(
     """
     kept: deque[tuple[int, Prepared]] = deque()
     for t in frames:
-        first, last = max(0, t - window // 2), min(length - 1, t + look_ahead(window))
+        first = max(0, t - window // 2)
+        last = min(length - 1, t + look_ahead(window))
         while kept and kept[0][0] < first:
             kept.popleft()
         for i in range(kept[-1][0] + 1 if kept else first, last + 1):
@@ -181,7 +187,8 @@ def restore(
     """
     codes = checked_codes(codes, sensor)
     check_window(window)
-    domain, table = information_domain(sensor, exposure), sensor.response(exposure)
+    domain = information_domain(sensor, exposure)
+    table = sensor.response(exposure)
     frames = range(len(codes)) if frames is None else frames
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     height, width = codes.shape[1:]

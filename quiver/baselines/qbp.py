@@ -87,7 +87,8 @@ def restore(
     frames = range(len(codes)) if frames is None else frames
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     for i, frame in enumerate(frames):
-        merged, count = merge(codes, frame, table, window, settings), len(_present(frame, window, len(codes)))
+        merged = merge(codes, frame, table, window, settings)
+        count = len(_present(frame, window, len(codes)))
         if excess is None:
             restored[i] = table.invert(merged, count)
         else:
@@ -102,7 +103,8 @@ def merge(codes: Array, frame: int, table: Response, window: int, settings: Sett
     check_window(window)
     if window % settings.block:
         raise ValueError(f"window is {window} frames, which blocks of {settings.block} do not divide")
-    here, start = _present(frame, window, len(codes)), frame - window // 2
+    here = _present(frame, window, len(codes))
+    start = frame - window // 2
     present = codes[here.start : here.stop]
     unit = _unit(present, table)
     stack = present.astype(np.float32) / unit
@@ -144,7 +146,8 @@ def frame_shifts(frames: Tensor, window: range, settings: Settings = CALIBRATED)
     `window` holds the places of its frames; those below 0 and from K on lie beyond the ends of the clip. Means of
     blocks are matched (`_matched`). Shifts follow linearly in time between them, and at constant speed beyond.
     """
-    found, middle = _matched(len(frames), window, settings), window[len(window) // 2]
+    found = _matched(len(frames), window, settings)
+    middle = window[len(window) // 2]
     pyramids = [patch_alignment.pyramid(frames[span.start : span.stop].mean(0)) for span in found]
     own = next(i for i, span in enumerate(found) if middle in span)
     still = zeros(*patch_alignment.grid(frames.shape[1:], patch_alignment.LEVELS[0])[0].shape)
@@ -185,9 +188,11 @@ def _interpolate(place: Tensor, known: Tensor, values: Tensor) -> Tensor:
     if len(known) == 1:
         return xp.broadcast_to(values, (len(place), *values.shape[1:]))
     if known[0] == 0:
-        known, values = xp.concat([-known[1:2], known]), xp.concat([-values[1:2], values])
+        known = xp.concat([-known[1:2], known])
+        values = xp.concat([-values[1:2], values])
     elif known[-1] == 0:
-        known, values = xp.concat([known, -known[-2:-1]]), xp.concat([values, -values[-2:-1]])
+        known = xp.concat([known, -known[-2:-1]])
+        values = xp.concat([values, -values[-2:-1]])
     within = xp.clip(place, float(known[0]), float(known[-1]))
     right = xp.clip(xp.searchsorted(known, within), 1, len(known) - 1)
     share = (within - known[right - 1]) / (known[right] - known[right - 1])
@@ -211,7 +216,9 @@ def _warp_block(frames: Tensor, shifts: Tensor, corner: Tensor, smooth: bool) ->
             else patch_alignment.gather(image, whole(position), size)
         )
         valid = patch_alignment.inside(image.shape, position, size)
-        total, count, edge = total + patch * valid, count + valid, edge + patch
+        total = total + patch * valid
+        count = count + valid
+        edge = edge + patch
     return xp.where(count > 0, total / xp.clip(count, 1, None), edge / len(frames))
 
 
@@ -221,9 +228,12 @@ def _merge_patches(
     """Return the merged image from blocks of frames [F, H, W] in a unit of codes, and shifts [F, 2, N]: aligned
     patches, spectra, Wiener weights, overlap-add. Blocks count by their frames.
     """
-    shape, counts = blocks[0][0].shape[1:], [len(frames) for frames, _ in blocks]
+    shape = blocks[0][0].shape[1:]
+    counts = [len(frames) for frames, _ in blocks]
     corner = patch_alignment.grid(shape, patch_alignment.LEVELS[0])[0]
-    size, own, smooth = patch_alignment.LEVELS[0].patch, counts[middle], settings.refine_finest
+    size = patch_alignment.LEVELS[0].patch
+    own = counts[middle]
+    smooth = settings.refine_finest
     reference = _warp_block(*blocks[middle], corner, smooth)
     noise = size * size * settings.wiener * _noise(reference, own, table, unit, settings)
     spectrum = xp.fft.rfft2(reference, None, (0, 1))
@@ -255,7 +265,8 @@ def _noise(reference: Tensor, frames: int, table: Response, unit: float, setting
 
 def overlap_add(patches: Tensor, corner: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return an image of this shape: the mean of overlapping patches [size, size, N], weighted by a raised cosine."""
-    size, width = patches.shape[0], shape[1]
+    size = patches.shape[0]
+    width = shape[1]
     step = xp.arange(size)
     one = 0.5 - 0.5 * xp.cos(2 * xp.pi * (single(step) + 0.5) / size)
     weight = xp.outer(one, one)[..., None]

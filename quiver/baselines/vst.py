@@ -97,7 +97,8 @@ def stabiliser(sensor: Sensor, exposure: float, times: tuple[int, ...], kind: Ki
     Codes of different frames are taken once each; a frame that is reflected is taken several times.
     """
     table = sensor.response(exposure)
-    top, samples = sensor.levels - 1, sum(times)
+    top = sensor.levels - 1
+    samples = sum(times)
     mean_code = np.linspace(0, top, max(4096, samples * top + 1))
     match kind:
         case "table":

@@ -16,12 +16,15 @@ MEASURING = ("split", "sensor", "bits", "ppp", "methods", "seed", "memory", "mod
 
 def add_domain(sub: Any) -> None:
     parser = command(
-        sub, "domain", _run_domain,
+        sub,
+        "domain",
+        _run_domain,
         "Measure where weights are better than the classical methods and store it in their file, or show it.",
         "quiver domain mergenet\n"
         "quiver domain out/mine out/data --bits 1,3 --ppp 1,3.25,10\n"
-        "quiver domain out/mine out/data --sensor spad-320x240 --bits 1 --ppp 0.3,1,3", resumes=True,
-    )  # fmt: skip
+        "quiver domain out/mine out/data --sensor spad-320x240 --bits 1 --ppp 0.3,1,3",
+        resumes=True,
+    )
     parser.add_argument("weights", help="shipped weights, a .safetensors file, or a folder of `quiver train`")
     parser.add_argument(
         "clips", nargs="*", type=Path, help="data sets and clip folders that were not used for training or tuning"
@@ -58,7 +61,8 @@ def _run_domain(args: argparse.Namespace) -> int:
         from quiver.evaluation.domain_measurement import forget_damaged, measure
 
         threads.check(args.threads)
-        options, settings = running_options(args), _settings(args)
+        options = running_options(args)
+        settings = _settings(args)
         if args.force:
             forget_damaged(path)
         refuse_idle(vars(args), [network_restorer(path, options)])

@@ -38,12 +38,16 @@ OURS = r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|crops
 
 def add_evaluate(sub: Any) -> None:
     parser = command(
-        sub, "evaluate", _run_evaluate, "Compare methods on held-out clips, or on real photons of a static object.",
+        sub,
+        "evaluate",
+        _run_evaluate,
+        "Compare methods on held-out clips, or on real photons of a static object.",
         "quiver evaluate out/starter -o out/table --methods naive,moment,out/mine,out/unet --ppp 3.25,9.75,26\n"
         "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,mergenet --split all\n"
         "quiver evaluate I2-2000FPS/test -o out/published --protocol quiver-published --methods moment,out/mine\n"
-        "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,mergenet", resumes=True,
-    )  # fmt: skip
+        "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,mergenet",
+        resumes=True,
+    )
     parser.add_argument("source", nargs="?", help="data set or clip folder; with --protocol the folder of a test set")
     parser.add_argument("-o", "--output", type=Path, help="folder for evaluation.md, .json, .png (needed for clips)")
     parser.add_argument(
@@ -119,7 +123,8 @@ def _prepared(args: argparse.Namespace, methods: Sequence[Any]) -> Iterator[tupl
         return
     from quiver.data.test_sets import TEST_SETS, counted, describe, import_test_set
 
-    which, source = TEST_SETS[args.protocol], Path(args.source)
+    which = TEST_SETS[args.protocol]
+    source = Path(args.source)
     described = describe(source, which)
     with _folder(args, comparison):
         with bar("clips", "clip") as progress:
@@ -185,7 +190,8 @@ def _check_source(args: argparse.Namespace) -> None:
     """Raise `ValueError` if --force would remove the source with the imported clips, or a test set would hold them."""
     from quiver.evaluation.comparison import CLIPS
 
-    source, clips = Path(args.source).resolve(), (args.output / CLIPS).resolve()
+    source = Path(args.source).resolve()
+    clips = (args.output / CLIPS).resolve()
     if clips in (source, *source.parents) or (args.protocol is not None and source in clips.parents):
         raise ValueError(
             f"{args.source}: overlaps with {args.output / CLIPS}, which is for imported clips; choose another -o"
@@ -222,7 +228,8 @@ def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
     if not args.static.is_file():
         raise FileNotFoundError(f"{args.static}: no such file")
     counts = read_counts(args.static)
-    bits, frames = (args.bits or (3,))[0], args.frames or 11
+    bits = (args.bits or (3,))[0]
+    frames = args.frames or 11
     check_domain(args, methods, [counted(counts, bits)])
     scores = evaluate_static(
         counts, methods, frames=frames, bits=bits, splits=args.splits or 3, seed=args.seed or 0, peak=args.peak
@@ -254,10 +261,13 @@ def _refuse_for_counts(args: argparse.Namespace) -> None:
 
 def add_bench(sub: Any) -> None:
     parser = command(
-        sub, "bench", _run_bench, "Measure what a restored frame costs, beside its PSNR.",
+        sub,
+        "bench",
+        _run_bench,
+        "Measure what a restored frame costs, beside its PSNR.",
         "quiver bench\n"
         "quiver bench --methods moment,mergenet,quiver-s --modes exact,streaming,windows --size 128x128 -o out/bench",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "--methods",
         type=words,

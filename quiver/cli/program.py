@@ -77,9 +77,12 @@ def _methods() -> list[str]:
 
 def _add_convert_weights(sub: Any) -> None:
     parser = command(
-        sub, "convert-weights", _run_convert_weights, "Turn a checkpoint of the published network into ours.",
+        sub,
+        "convert-weights",
+        _run_convert_weights,
+        "Turn a checkpoint of the published network into ours.",
         "quiver convert-weights quiver.pth -o out/quiver.safetensors",
-    )  # fmt: skip
+    )
     parser.add_argument("source", type=Path, help="checkpoint (.pt, .pth, .ckpt, .safetensors); never unpickled")
     parser.add_argument("-o", "--output", type=Path, required=True, help=".safetensors to write")
     parser.add_argument("--force", action="store_true", help="replace an existing file")

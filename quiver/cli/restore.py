@@ -24,14 +24,17 @@ from quiver.restoration.interface import DEFAULT_METHOD
 
 def add_restore(sub: Any) -> None:
     parser = command(
-        sub, "restore", _run_restore, "Restore a stream, a clip or a photon cube; no ground truth is needed.",
+        sub,
+        "restore",
+        _run_restore,
+        "Restore a stream, a clip or a photon cube; no ground truth is needed.",
         "quiver restore out/starter/clips/fan_0003 -o out/fan.npy\n"
         "quiver restore out/fan/streams/quiver-physical_3bit_3.25ppp.npy -o out/fan.npy --method out/mine\n"
         "quiver restore out/fan --ppp 3.25 -o out/fan.npy --method moment\n"
         "quiver restore cube.npy --width 320 --planes 7 --sensor spad-320x240 --frame-rate 1428 -o out/cube.npy\n"
         "quiver restore out/cubes/test -o out/submission.zip --planes 7",
         resumes=True,
-    )  # fmt: skip
+    )
     parser.add_argument(
         "source",
         type=Path,
@@ -93,7 +96,8 @@ def _run_restore(args: argparse.Namespace) -> int:
     if why is not None:
         note(why)
     target.parent.mkdir(parents=True, exist_ok=True)
-    lines, started = [assumed(codes, method)], time.monotonic()
+    lines = [assumed(codes, method)]
+    started = time.monotonic()
     with bar(method.name) as progress:
 
         def shown(done: int, total: int) -> None:
@@ -126,7 +130,8 @@ def _restore_cubes(args: argparse.Namespace) -> int:
     idle = ("stream", "sensor", "ppp", "bits", "seed", "width", "frame_rate", "defects")
     refuse(args, idle, f"{target} is a submission, whose layout states it")
     check_target(target, args.force)
-    found, planes = cubes(args.source), args.planes or 1
+    found = cubes(args.source)
+    planes = args.planes or 1
     bands = [band_codes(cube, colour, planes) for cube in found for colour in range(len(COLOURS))]
     method, why = chosen_for_all(args.method, bands, running_options(args))
     refuse_idle(vars(args), [method])

@@ -38,12 +38,15 @@ DIVERGED = 3  # exit code of a run whose loss became NaN or infinite
 
 def add_train(sub: Any) -> None:
     parser = command(
-        sub, "train", _run_train, "Train a network on the clips of a data set; rerun the same command to resume.",
+        sub,
+        "train",
+        _run_train,
+        "Train a network on the clips of a data set; rerun the same command to resume.",
         "quiver train out/starter -o out/mine --minutes 20\n"
         "quiver train out/starter -o out/unet --preset unet --protocol control --minutes 20\n"
         "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
         resumes=True,
-    )  # fmt: skip
+    )
     parser.add_argument(
         "data",
         nargs="+",
@@ -113,14 +116,17 @@ def _run_train(args: argparse.Namespace) -> int:
     if args.preset.startswith("bit2bit"):
         settings = _of_stream(args, settings)
     if args.validate_every is not None and settings.steps is None:
-        raise ValueError("--validate-every: counts steps of a run with --steps; a run that --minutes ends is validated "
-                         "after every tenth of its time; leave it out")  # fmt: skip
+        raise ValueError(
+            "--validate-every: counts steps of a run with --steps; a run that --minutes ends is validated "
+            "after every tenth of its time; leave it out"
+        )
     if args.validation_split is not None and not split_clips(settings.data, args.validation_split)[1]:
         raise ValueError(
             f"--validation-split {args.validation_split}: {', '.join(settings.folders)} has no clip in that split; "
             "leave it out, and without clips in `val` training clips serve"
         )
-    folder, leads = Path(settings.out), os.environ.get("RANK", "0") == "0"
+    folder = Path(settings.out)
+    leads = os.environ.get("RANK", "0") == "0"
     earlier = None if args.force else threads.recorded(folder / "settings.json")
     settings = replace(settings, threads=use_threads(args, earlier))
     torch.manual_seed(settings.seed)
@@ -191,8 +197,10 @@ def network_of(args: argparse.Namespace, settings: Any, first: Path | None = Non
         return network
     loaded = weights.load(first)
     if type(loaded) is not type(network) or loaded.config != network.config:
-        raise ValueError(f"--start {first}: weights of {type(loaded).__name__} with another configuration than the "
-                         f"preset {args.preset}; name the preset that they were trained with")  # fmt: skip
+        raise ValueError(
+            f"--start {first}: weights of {type(loaded).__name__} with another configuration than the "
+            f"preset {args.preset}; name the preset that they were trained with"
+        )
     return loaded.train()
 
 
@@ -236,9 +244,13 @@ def _drop_after(best: float, history: Sequence[Mapping[str, float]]) -> str:
 
 def add_ablate(sub: Any) -> None:
     parser = command(
-        sub, "ablate", _run_ablate, "Train the network in six versions, without some of its parts, and compare them.",
-        "quiver ablate out/starter -o out/ablation --minutes 20", resumes=True,
-    )  # fmt: skip
+        sub,
+        "ablate",
+        _run_ablate,
+        "Train the network in six versions, without some of its parts, and compare them.",
+        "quiver ablate out/starter -o out/ablation --minutes 20",
+        resumes=True,
+    )
     parser.add_argument("data", help="data set folder")
     parser.add_argument("-o", "--output", required=True, help="folder of the six runs and their table")
     add_preset(parser, "quiver-s", QUIVERS)

@@ -52,7 +52,8 @@ def split_clips(path: Path | str | Iterable[Path | str], validation: str) -> tup
 
     A clip folder is in every split, so it trains. The split `train` validates on the training clips.
     """
-    training, validating = open_clips(path, "train"), open_clips(path, validation)
+    training = open_clips(path, "train")
+    validating = open_clips(path, validation)
     trained = {clip.path.resolve() for clip in training} if validation != "train" else set()
     return training, [clip for clip in validating if clip.path.resolve() not in trained]
 

@@ -38,7 +38,8 @@ class CodeTable:
         while sensor.cdf(np.array([brightest]), exposure)[0, -2] > 1e-4 and brightest < 64 * sensor.white(exposure):
             brightest *= 1.25
         edges = np.linspace(0, np.sqrt(brightest), CELLS) ** 2  # the last cell is open: all photons above
-        darkest, lightest = edges * (1 - MARGIN), edges[1:] * (1 + MARGIN)
+        darkest = edges * (1 - MARGIN)
+        lightest = edges[1:] * (1 + MARGIN)
         low = sensor.cdf(darkest, exposure)[:, :-1]
         high = np.concatenate([sensor.cdf(lightest, exposure)[:, :-1], np.zeros((1, low.shape[1]))])
         if np.isfinite(sensor.brightest(exposure)) or (np.diff(low, axis=0) > 1e-9).any():
@@ -64,7 +65,8 @@ class CodeTable:
                     raise LookupError("32 bits do not decide; give second words")
                 return second.ravel()[open_[undecided]]
 
-            light, words = photons.ravel()[open_], first.ravel()[open_]
+            light = photons.ravel()[open_]
+            words = first.ravel()[open_]
             codes.ravel()[open_] = self.sensor.draw(light, self.exposure, words, further)
         return codes
 

@@ -283,7 +283,8 @@ def codes_of(stream: Stream) -> Codes:
 
     An imported stream states no light: pixels are hot beside the light that its codes tell.
     """
-    codes, table = stream_codes(stream), stream.meta.get("defects")
+    codes = stream_codes(stream)
+    table = stream.meta.get("defects")
     if table is None or stream.meta.get("ppp") is not None:
         return codes
     try:

@@ -87,7 +87,8 @@ def of_stream(stream: Stream) -> tuple[Array | None, Sensor]:
 
     A warning where a map is missing.
     """
-    table, ppp = stream.meta.get("defects"), stream.meta.get("ppp")
+    table = stream.meta.get("defects")
+    ppp = stream.meta.get("ppp")
     if table is None or ppp is None:
         return None, stream.sensor
     _, height, width = stream.shape

@@ -61,7 +61,8 @@ class Noise(Illumination):
     @classmethod
     def of_stream(cls, stream: Stream) -> Noise:
         """Return the noise of a stored stream. `ValueError` if training windows cannot have it."""
-        meta, where = stream.meta, stream.path.with_suffix(".json")
+        meta = stream.meta
+        where = stream.path.with_suffix(".json")
         planes = meta.get("planes_per_code") or 1
         if planes != 1:
             raise ValueError(f"{where}: a code takes {planes} clip frames, a training window one for each; {OTHERS}")
@@ -73,11 +74,13 @@ class Noise(Illumination):
             )
         name = str(meta.get("sensor_name") or stream.sensor.to_dict()["model"])
         named = "sensor_name" in meta and not name.endswith(".toml")
-        ppp, lux = meta.get("ppp_target"), meta.get("lux_target")
+        ppp = meta.get("ppp_target")
+        lux = meta.get("lux_target")
         if "ppp_target" not in meta:  # written by another program
             ppp = meta.get("ppp")
         if lux is not None and "pixel_pitch" in meta:  # of a clip without a camera: these lux are so many photons
-            ppp, lux = meta["ppp"], None
+            ppp = meta["ppp"]
+            lux = None
         defects = meta.get("defects")
         return cls(
             name,
@@ -222,7 +225,8 @@ def noise_table(sensor: Sensor, exposure: float) -> Array:
     largest mean that of the brightest light. The array is shared and read-only. `ValueError` for a sensor whose mean
     code does not rise with light.
     """
-    response, top = sensor.response(exposure), sensor.levels - 1
+    response = sensor.response(exposure)
+    top = sensor.levels - 1
     steps = np.linspace(0, top, NODES)
     table = (np.interp(steps, response.mean, response.variance) / top**2).astype(np.float32)
     table.setflags(write=False)

@@ -43,7 +43,8 @@ def plane_bits(planes: int) -> int:
     bits = planes.bit_length()
     if 1 <= planes == 2**bits - 1 < 2**16:
         return bits
-    lower, higher = 2 ** ((planes + 1).bit_length() - 1) - 1, 2 ** (planes + 1).bit_length() - 1
+    lower = 2 ** ((planes + 1).bit_length() - 1) - 1
+    higher = 2 ** (planes + 1).bit_length() - 1
     near = 1 if planes < 1 else 65535 if higher > 65535 else f"{lower} or {higher}"
     raise ValueError(f"planes: a b-bit code sums 2^b - 1 binary planes, got {planes}; use {near}")
 

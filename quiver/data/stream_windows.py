@@ -40,7 +40,8 @@ def law_of(codes: Codes) -> Law:
 
     `ValueError` for a stream whose codes are neither: a photon cannot be taken from them.
     """
-    sensor, exposure = codes.sensor, codes.exposure
+    sensor = codes.sensor
+    exposure = codes.exposure
     reason = _no_counts(codes)
     if reason is not None:
         raise ValueError(
@@ -114,11 +115,13 @@ class StreamWindows(Dataset[dict[str, Any]]):
 
     def __len__(self) -> int:
         """Return how many windows hold as many codes as the stream; numbers beyond are windows, too."""
-        frames, crop = self.settings.frames, self.settings.crop
+        frames = self.settings.frames
+        crop = self.settings.crop
         return int(np.ceil(np.prod(self.codes.shape) / (frames * crop**2)))
 
     def __getitem__(self, n: int) -> dict[str, Any]:
-        settings, rng = self.settings, np.random.default_rng((self.settings.seed, n))
+        settings = self.settings
+        rng = np.random.default_rng((self.settings.seed, n))
         length, height, width = self.codes.shape
         start, y, x = (
             int(rng.integers(most - size + 1))

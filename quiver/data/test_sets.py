@@ -168,7 +168,8 @@ def _check_target(target: Path, meta: dict[str, Any]) -> None:
     if not target.exists():
         return
     clip = Clip.open(target)
-    wanted, found = dict(meta["source"]), clip.meta.get("source") or {}
+    wanted = dict(meta["source"])
+    found = clip.meta.get("source") or {}
     same = list(clip.shape) == meta["shape"]
     if found == wanted and same:
         return

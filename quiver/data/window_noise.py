@@ -99,7 +99,8 @@ def window_codes(
     lead = min(array.lead(NEGLIGIBLE), before)
     (dy, dx), last, reach = place.drift, frames - 1, array.reach
     y, x = (sorted((first, first + last * way)) for first, way in zip((place.y, place.x), (dy, dx), strict=True))
-    top, left = min(reach, y[0]), min(reach, x[0])
+    top = min(reach, y[0])
+    left = min(reach, x[0])
     rows = top + side + min(reach, height - y[1] - side)
     columns = left + side + min(reach, width - x[1] - side)
 

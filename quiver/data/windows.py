@@ -42,7 +42,10 @@ from quiver.data.window_noise import WindowPlace, behind_defects, check_windows,
 # where samples are drawn, in worker processes too, and gets no gradients; it is a function of a module, not a lambda.
 Prepare = Callable[[Codes], Mapping[str, torch.Tensor]]
 
-TRAINING, VALIDATION, STILL = 1, 2, 3  # stages of the random keys: no two uses share noise (0 is `qsim sense`)
+# stages of the random keys: no two uses share noise (0 is `qsim sense`)
+TRAINING = 1
+VALIDATION = 2
+STILL = 3
 
 
 @dataclass(frozen=True)
@@ -157,9 +160,12 @@ class Windows(Dataset[dict[str, Any]]):
         return dy, dx
 
     def _middle(self, index: int) -> WindowPlace:
-        settings, clip = self.settings, index % len(self.clips)
+        settings = self.settings
+        clip = index % len(self.clips)
         length, height, width = self.clips[clip].shape
-        start, y, x = (length - settings.frames) // 2, (height - settings.crop) // 2, (width - settings.crop) // 2
+        start = (length - settings.frames) // 2
+        y = (height - settings.crop) // 2
+        x = (width - settings.crop) // 2
         key = Key(seed=settings.seed, clip=index, stage=VALIDATION)
         return WindowPlace(clip, start, y, x, (0, 0), index // len(self.clips), 0, False, key)
 
@@ -167,7 +173,8 @@ class Windows(Dataset[dict[str, Any]]):
         """Return the numbers of at most `count` fixed windows, spread over the clips and over the light levels."""
         if self.length <= count:
             return list(range(self.length))
-        clips, lights = len(self.clips), len(self.noise.noises)
+        clips = len(self.clips)
+        lights = len(self.noise.noises)
         order = np.random.default_rng(0).permutation(clips)  # so that the light does not follow the order of clips
         return [n * lights // count * clips + int(order[n % clips]) for n in range(count)]
 
@@ -177,7 +184,8 @@ class Windows(Dataset[dict[str, Any]]):
 
     def __getitem__(self, n: int) -> dict[str, Any]:
         place = self.place(n)
-        clip, noise = self.clips[place.clip], self.noise.noises[place.light]
+        clip = self.clips[place.clip]
+        noise = self.noise.noises[place.light]
         draw, bad, behind = self._draw(place)
         photons, sharp = self.photons_of(place)
         scale = 1.0
@@ -217,7 +225,8 @@ class Windows(Dataset[dict[str, Any]]):
 
     def photons_of(self, place: WindowPlace) -> tuple[Array, Array]:
         """Return the expected photons of the exposed and of the sharp window, float64 [T, h, w] each, turned."""
-        clip, side = self.clips[place.clip], self.settings.crop
+        clip = self.clips[place.clip]
+        side = self.settings.crop
         (dy, dx), (draw, _, _) = place.drift, self._draw(place)
 
         def taken(sharp: bool) -> Array:
@@ -242,7 +251,9 @@ class Windows(Dataset[dict[str, Any]]):
 
     def _at_rest(self, place: WindowPlace) -> Array:
         """Return the photons [h, w] of the centre frame, turned, of a scene that rests there: without motion blur."""
-        clip, side, frames = self.clips[place.clip], self.settings.crop, self.settings.frames
+        clip = self.clips[place.clip]
+        side = self.settings.crop
+        frames = self.settings.frames
         (dy, dx), (draw, _, _) = place.drift, self._draw(place)
         i = frames - 1 - frames // 2 if place.backwards else frames // 2
         crop = (place.y + dy * i, place.x + dx * i, side, side)
@@ -252,7 +263,8 @@ class Windows(Dataset[dict[str, Any]]):
     def _draw(self, place: WindowPlace) -> tuple[Draw, Array | None, Sensor]:
         """Return what draws the codes of a place's clip and noise, its defective pixels, and the sensor behind them."""
         if (place.clip, place.light) not in self._draws:
-            noise, clip = self.noise.noises[place.light], self.clips[place.clip]
+            noise = self.noise.noises[place.light]
+            clip = self.clips[place.clip]
             draw = noise.draw(clip)
             self._draws[place.clip, place.light] = draw, *behind_defects(noise, draw, clip)
         return self._draws[place.clip, place.light]

@@ -57,7 +57,8 @@ def pooled(counts: Sequence[Sequence[int]], squares: Sequence[Sequence[float]]) 
     """
     if not counts:
         return [math.nan] * (len(EDGES) - 1)
-    pixels, total = np.sum(counts, axis=0), np.sum(squares, axis=0)
+    pixels = np.sum(counts, axis=0)
+    total = np.sum(squares, axis=0)
     return [metrics.decibel(s / n) if s > 0 else math.nan for n, s in zip(pixels, total, strict=True)]
 
 
@@ -70,7 +71,8 @@ def place(clip: Clip, t: int) -> tuple[slice, slice]:
     side = min(CROP, height, width)
     found = speeds(clip, range(t, t + 1))
     if found is None:
-        y, x = (height - side) // 2, (width - side) // 2
+        y = (height - side) // 2
+        x = (width - side) // 2
     else:
         moving = np.minimum(np.nan_to_num(found[0]), EDGES[-2])  # limits the influence of very fast pixels
         corners = [(y, x) for y in range(0, height - side + 1, 8) for x in range(0, width - side + 1, 8)]

@@ -148,9 +148,11 @@ def restore_clip(
     row = replace(row, device=method.device, threads=threads.current())
     frames = scored_frames(len(clip), comparison.published)
     white = peak_in_photons(comparison, clip, codes, factor)
-    target, valid = truth(clip, factor, frames.start, frames.stop) / white, known(clip, frames.start, frames.stop)
+    target = truth(clip, factor, frames.start, frames.stop) / white
+    valid = known(clip, frames.start, frames.stop)
     windows = list(windows_sensed(clip, light, comparison.seed, frames)) if comparison.published else []
-    memory, started = PeakMemory(method.device), time.perf_counter()
+    memory = PeakMemory(method.device)
+    started = time.perf_counter()
     try:
         if comparison.published:
             restored = np.concatenate([method.restore(one, PUBLISHED_EDGE, PUBLISHED_EDGE + 1) for one in windows])

@@ -205,8 +205,15 @@ def _in_own_process(case: CostCase, settings: CostSettings) -> CostRow:
         warnings.warn(f"{case.method}: {text}", stacklevel=3)
     if isinstance(found, CostRow):
         return found
-    return CostRow(**asdict(case), trained=False, seconds_per_frame=math.nan, peak_bytes=0, gmac_per_frame=math.nan,
-                psnr_matched=math.nan, failure=found)  # fmt: skip
+    return CostRow(
+        **asdict(case),
+        trained=False,
+        seconds_per_frame=math.nan,
+        peak_bytes=0,
+        gmac_per_frame=math.nan,
+        psnr_matched=math.nan,
+        failure=found,
+    )
 
 
 def _child(pipe: Any, case: CostCase, settings: CostSettings) -> None:

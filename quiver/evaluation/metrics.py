@@ -63,7 +63,8 @@ def _stack(name: str, image: np.ndarray) -> np.ndarray:
 
 def _pair(output: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return output and target as float64 [T, H, W]. `ValueError` if their shapes differ."""
-    one, two = _stack("output", output), _stack("target", target)
+    one = _stack("output", output)
+    two = _stack("target", target)
     if one.shape != two.shape:
         raise ValueError(f"output has shape {one.shape}, target {two.shape}; they must be equal")
     return one, two
@@ -110,7 +111,8 @@ def psnr(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None = None
     found = []
     for t, (a, b) in enumerate(zip(one, two, strict=True)):
         if keep is not None:
-            a, b = a[keep[t]], b[keep[t]]
+            a = a[keep[t]]
+            b = b[keep[t]]
         mse = float(np.mean((np.clip(a, 0, 1) - np.clip(b, 0, 1)) ** 2)) if a.size else nan
         found.append(decibel(mse) if mse > 0 or (a.size and np.array_equal(a, b)) else nan)
     return np.array(found)
@@ -125,7 +127,8 @@ def best_scale(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None 
     one, two = _pair(output, target)
     keep = _kept(valid, two)
     bright = one > 0 if keep is None else (one > 0) & keep
-    values, goal = one[bright], np.clip(two[bright], 0, 1)
+    values = one[bright]
+    goal = np.clip(two[bright], 0, 1)
 
     def error(s: float) -> float:
         return float(np.sum((np.minimum(s * values, 1) - goal) ** 2))
@@ -139,7 +142,8 @@ def best_scale(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None 
     if not values.size or error(1.0) == 0:
         return 1.0
     order = np.argsort(-values)  # the brightest reach the peak first
-    values, goal = values[order], goal[order]
+    values = values[order]
+    goal = goal[order]
     found = _least(values, goal)
     low, high = FACTORS
     return min((1.0, found, min(max(refined(found), low), high)), key=error)
@@ -150,9 +154,12 @@ def _least(values: np.ndarray, goal: np.ndarray) -> float:
     low, high = FACTORS
     white = 0.0  # error of the pixels that are at the peak already
     square, product, rest = (float(np.sum(x)) for x in (values * values, values * goal, goal * goal))
-    least, best, edge = inf, 1.0, 0.0
+    least = inf
+    best = 1.0
+    edge = 0.0
     for start in range(0, len(values) + 1, CHUNK):
-        v, g = values[start : start + CHUNK], goal[start : start + CHUNK]
+        v = values[start : start + CHUNK]
+        g = goal[start : start + CHUNK]
         edges = 1 / np.maximum(v, 1e-300)
         last = start + CHUNK > len(values)  # the piece in which every pixel is at the peak
         ends = np.append(edges, inf) if last else edges
@@ -160,9 +167,12 @@ def _least(values: np.ndarray, goal: np.ndarray) -> float:
         a, b, c, w = (
             np.append(total, total + sign * np.cumsum(part))
             for total, sign, part in (
-                (square, -1, v * v), (product, -1, v * g), (rest, -1, g * g), (white, 1, (1 - g) ** 2)
+                (square, -1, v * v),
+                (product, -1, v * g),
+                (rest, -1, g * g),
+                (white, 1, (1 - g) ** 2),
             )
-        )  # fmt: skip
+        )
         square, product, rest, white = (float(x[-1]) for x in (a, b, c, w))
         edge = float(edges[-1]) if len(edges) else edge
         a, b, c, w = (x[: len(ends)] for x in (a, b, c, w))
@@ -173,7 +183,8 @@ def _least(values: np.ndarray, goal: np.ndarray) -> float:
         errors = np.where(inside, w + s * s * a - 2 * s * b + c, inf)
         i = int(np.argmin(errors))
         if errors[i] < least:
-            least, best = float(errors[i]), float(s[i])
+            least = float(errors[i])
+            best = float(s[i])
     return best
 
 
@@ -243,7 +254,8 @@ def score_and_factors(
         scored = ~np.isnan(raw)
         better = not np.isnan(matched[scored]).any() and _mean(matched[scored]) >= _mean(raw)
         worse = np.full(len(one), not better)
-    scales, matched = np.where(worse, 1.0, scales), np.where(worse | np.isnan(raw), raw, matched)
+    scales = np.where(worse, 1.0, scales)
+    matched = np.where(worse | np.isnan(raw), raw, matched)
     scaled = one * scales.reshape(-1, *(1,) * (one.ndim - 1))
     hidden = np.isnan(raw)
     found = Score(
@@ -313,7 +325,8 @@ def clamped_variance(mean: np.ndarray, variance: np.ndarray, peak: float = 1.0) 
     spread = np.sqrt(np.maximum(variance, 0))
     safe = np.where(spread > 0, spread, 1.0)
     z = (peak - mean) / safe
-    below, density = ndtr(z), np.exp(-0.5 * z * z) / sqrt(2 * pi)
+    below = ndtr(z)
+    density = np.exp(-0.5 * z * z) / sqrt(2 * pi)
     first = mean * below - safe * density + peak * (1 - below)
     second = (mean**2 + safe**2) * below - safe * (mean + peak) * density + peak**2 * (1 - below)
     return np.where(spread > 0, np.maximum(second - first**2, 0), 0.0)

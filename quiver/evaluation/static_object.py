@@ -80,13 +80,15 @@ def score_split(
 
     `given` are the frames to restore from, `peak` is in photons.
     """
-    centre, codes = len(given) // 2, counted(counts, bits, given)
+    centre = len(given) // 2
+    codes = counted(counts, bits, given)
     first, last = (centre, centre + 1) if method.seamless else (0, len(given))  # a state needs the complete stream
     restored = method.restore(codes, first, last)[centre - first]
     output = restored / (peak * float(counts.shares[given[seen_by(method, centre)]].mean()))
     others = np.setdiff1d(np.arange(len(counts.frames)), given)
     target, variance = reference(counts, others)
-    target, noise = target / peak, variance / peak**2
+    target = target / peak
+    noise = variance / peak**2
     scale = metrics.best_scale(output, target)
     return (
         _decibel(mean_square(output, target, noise)),

@@ -128,7 +128,8 @@ def markdown(
 
     `remarks` are lines about what was scored, and about networks outside of what they were measured for.
     """
-    by_name, count = {method.name: method for method in methods}, len({row.clip for row in rows})
+    by_name = {method.name: method for method in methods}
+    count = len({row.clip for row in rows})
     text = [
         f"# Evaluation of {comparison.source}, split {comparison.split or 'all'}, {count} clip{'s' * (count != 1)}",
         "",
@@ -174,7 +175,8 @@ def frames_of(method: Restorer, *, published: bool) -> tuple[int | None, int]:
     """
     future = method.look_ahead
     if published:
-        past, future = min(method.window - 1 - future, PUBLISHED_EDGE), min(future, PUBLISHED_EDGE)
+        past = min(method.window - 1 - future, PUBLISHED_EDGE)
+        future = min(future, PUBLISHED_EDGE)
         return past + 1 + future, future
     return method.frames_used if method.seamless else None, future
 
@@ -284,7 +286,8 @@ def as_dict(
 def figure(rows: Sequence[ComparisonRow], path: Path) -> None:
     """Draw the matched PSNR of each method with its interval, one group of bars per light level, as PNG."""
     lines = [line for line in summarise(rows) if line.scores["psnr"].scenes]
-    lights, methods = list(dict.fromkeys(x.light for x in lines)), list(dict.fromkeys(x.method for x in lines))
+    lights = list(dict.fromkeys(x.light for x in lines))
+    methods = list(dict.fromkeys(x.method for x in lines))
     drawing = new_figure(4 + 1.2 * max(3, len(lights) * len(methods) / 2), 4)
     axes = drawing.subplots()
     width = 0.8 / max(1, len(methods))

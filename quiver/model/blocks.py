@@ -27,7 +27,9 @@ NEIGHBOURS = 5  # consecutive frames that a feature extractor takes
 PASSES = 5  # of the pre-denoiser's block
 BLOCKS = 11  # of the recurrent cell
 OFFSET_LIMIT = 10.0  # px, largest offset that the alignment adds to the flow
-GREY_MEAN, GREY_DEVIATION = 0.449, 0.226  # standardisation of the flow network's input; kept as float32 buffers
+# standardisation of the flow network's input; kept as float32 buffers
+GREY_MEAN = 0.449
+GREY_DEVIATION = 0.226
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ def warp(image: Tensor, flow: Tensor, padding: Literal["zeros", "border"] = "zer
     if flow.shape != (image.shape[0], 2, *image.shape[2:]):
         raise ValueError(f"warp: flow must be {(image.shape[0], 2, *image.shape[2:])}, got {tuple(flow.shape)}")
     with torch.autocast(image.device.type, enabled=False):
-        image, flow = _at_least_float32(image), _at_least_float32(flow)
+        image = _at_least_float32(image)
+        flow = _at_least_float32(flow)
         image, flow = _same_type(image, flow)
         height, width = image.shape[2:]
         x = torch.arange(width, dtype=flow.dtype, device=flow.device) + flow[:, 0]
@@ -57,8 +58,12 @@ def deform_conv2d(
     """
     with torch.autocast(image.device.type, enabled=False):
         dtype = _at_least_float32(image).dtype
-        image, offset, weight = image.to(dtype), offset.to(dtype), weight.to(dtype)
-        count, channels, taps = image.shape[0], image.shape[1], weight.shape[2] * weight.shape[3]
+        image = image.to(dtype)
+        offset = offset.to(dtype)
+        weight = weight.to(dtype)
+        count = image.shape[0]
+        channels = image.shape[1]
+        taps = weight.shape[2] * weight.shape[3]
         out_size = _output_size(image, weight, stride, padding, dilation)
         if offset.shape[0] != count or offset.shape[1] % (2 * taps) or tuple(offset.shape[2:]) != out_size:
             raise ValueError(
@@ -127,7 +132,8 @@ def _tap_samples(image: Tensor, y: Tensor, x: Tensor) -> Tensor:
 def _contract(samples: Tensor, weight: Tensor, part: slice) -> Tensor:
     """Sum over channels and taps: [N, G, C/G, k, oh, ow] x [Co, C/groups, kh, kw] -> [N, Co, oh, ow]."""
     count, height, width = samples.shape[0], *samples.shape[4:]
-    out, fan = weight.shape[0], weight.shape[1]
+    out = weight.shape[0]
+    fan = weight.shape[1]
     channels = samples.shape[1] * samples.shape[2]
     groups = channels // fan
     kernel = weight.flatten(2)[:, :, part].reshape(groups, out // groups, -1)

@@ -148,7 +148,8 @@ class QUIVER(nn.Module):
         def pairs(features: Sequence[Tensor], part: slice) -> list[Pair]:
             return [(_flat(f[:, :-1][:, part]), _flat(f[:, 1:][:, part])) for f in features]
 
-        r1, r2 = {}, {}
+        r1 = {}
+        r2 = {}
         entries = [self.encode_first([image[:, 0] for image in images])[2]]
         for part in _parts(length - 1, frames):
             now = [_flat(image[:, 1:][:, part]) for image in images]
@@ -163,7 +164,8 @@ class QUIVER(nn.Module):
 
     def recur(self, entries: Sequence[Tensor]) -> list[Tensor]:
         """Entries [N, 6C, h, w] in time order -> R4 [N, 4C, h, w] of every frame; the last state is not computed."""
-        state, results = self.first_state(entries[0]), []
+        state = self.first_state(entries[0])
+        results = []
         for t, entry in enumerate(entries):
             results.append(self.cell.step(entry, state))
             if t + 1 < len(entries):

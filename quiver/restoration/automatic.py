@@ -68,7 +68,8 @@ def _best(codes: Codes, known: dict[str, Restorer], options: RestoreOptions | No
     except ModuleNotFoundError as error:
         return WITHOUT, f"{NETWORK} {MISSING} {error.name}"
     domain = None if network.scope is None else network.scope.domain
-    measured, unknown = "", ""
+    measured = ""
+    unknown = ""
     for part in by_colour(codes):
         ppp = light_of(part)
         cell = None if domain is None else domain.nearest(place_of(part.sensor, part.exposure, ppp))

@@ -189,7 +189,8 @@ def table(domain: Domain) -> list[str]:
     """Return the cells as a Markdown table, the winner of each in bold."""
     rows = []
     for cell in domain.cells:
-        ours, theirs = f"{cell.network:.2f}", f"{cell.classical_psnr:.2f}"
+        ours = f"{cell.network:.2f}"
+        theirs = f"{cell.classical_psnr:.2f}"
         ours, theirs = (f"**{ours}**", theirs) if cell.wins else (ours, f"**{theirs}**")
         rows.append((cell.sensor, str(cell.place.bits), f"{cell.ppp:g}", ours, f"{cell.classical} {theirs}"))
     return markdown_table(rows, ("sensor", "bits", "PPP", "network", "best classical method"))

@@ -16,7 +16,9 @@ from quiver.restoration.mosaics import by_colour
 
 DARK = 0.1  # dark counts over the events of the mean light, above which a stream is unlike all cells
 CHANGE = 0.08  # of the light within eleven frames, above which a stream is unlike all cells: they reach 0.05
-FRAMES, BINARY_FRAMES = 4, 11  # of the shortest stream that is like them, of more bits and of one: restorer_limits.md
+# of the shortest stream that is like them, of more bits and of one: restorer_limits.md
+FRAMES = 4
+BINARY_FRAMES = 11
 LOOKED_AT = 11  # frames in the middle of the stream, in which a change of light is looked for
 SIDE = 16  # px of a square, less where the picture is small
 FEWEST = 9  # squares, below which the answer is 0
@@ -173,7 +175,8 @@ def light_change(codes: Codes) -> float:
     """
     length, height, width = codes.shape
     side = max(4, min(SIDE, height // 6, width // 6))
-    rows, columns = height // side, width // side
+    rows = height // side
+    columns = width // side
     if rows * columns < 2 * FEWEST or length < 2 or codes.shares is not None:
         return 0.0
     first = max(0, (length - LOOKED_AT) // 2)
@@ -196,5 +199,6 @@ def _change(light: Array) -> float:
     factors = np.median(ratios, axis=1)
     spread = DEVIATION * np.median(np.abs(ratios - factors[:, None]), axis=1)
     errors = MEDIAN * spread / np.sqrt(bright.shape[1])
-    low, high = int(factors.argmin()), int(factors.argmax())
+    low = int(factors.argmin())
+    high = int(factors.argmax())
     return float(max(0.0, factors[high] - factors[low] - CERTAIN * np.hypot(errors[low], errors[high])))

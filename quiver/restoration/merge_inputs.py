@@ -39,7 +39,8 @@ def middle_inputs(codes: Codes) -> tuple[MergeInputs, InformationDomain]:
     """Return the inputs of the middle frame of a window of codes, cut to its size, and the tables of its sensor."""
     domain = information_domain(codes.sensor, codes.exposure)
     length, height, width = codes.shape
-    window, middle = codes.read(0, length), length // 2
+    window = codes.read(0, length)
+    middle = length // 2
     found = merge_inputs(next(stream(lambda t: window[t], length, domain, length, range(middle, middle + 1))), domain)
     cut = MergeInputs(*(x[..., :height, :width] for x in (found.channels, found.phi, found.deviation)))
     return cut, domain

@@ -33,7 +33,9 @@ def fill_merged(
     length, height, width = codes.shape
     domain = information_domain(codes.sensor, codes.exposure)
     pieces = cut_pieces(network, height, width, options.bound(host=True))  # merging runs on the CPU
-    apart, done, read = Disagreement.nothing(height, width), 0, frame_reader(codes)
+    apart = Disagreement.nothing(height, width)
+    done = 0
+    read = frame_reader(codes)
     for tile in pieces.tiles:
         rows, columns = tile.weight.shape
         part = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))

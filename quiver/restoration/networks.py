@@ -72,14 +72,21 @@ def wrap_network(
     device = pick_device(options.device)
     model.to(device).eval()
     run: RestoreNetwork = fill_network
-    window, look_ahead, together, seen = WINDOW, RADIUS, 1, None
+    window = WINDOW
+    look_ahead = RADIUS
+    together = 1
+    seen = None
     if mode == "streaming":  # features reach further, and the state back to the first frame
-        window, look_ahead = WINDOW + REACH, RADIUS + REACH
+        window = WINDOW + REACH
+        look_ahead = RADIUS + REACH
     if isinstance(model, MergeNet):
         run = fill_merged
     elif takes_clips(model):
         part = part_of(model)
-        run, window, look_ahead, together = fill_parts, part.past + 1 + part.future, part.future, part.kept
+        run = fill_parts
+        window = part.past + 1 + part.future
+        look_ahead = part.future
+        together = part.kept
         description = f"{description}; look-ahead {look_ahead} frames"
         seen = min(window, part.seen)
 
@@ -100,9 +107,19 @@ def wrap_network(
         return cut_pieces(model, height, width, options.bound(host=isinstance(model, MergeNet))).text
 
     return Restorer(
-        name, window, look_ahead, True, description, fill, mode != "streaming", identity, cut, together, device=device,
+        name,
+        window,
+        look_ahead,
+        True,
+        description,
+        fill,
+        mode != "streaming",
+        identity,
+        cut,
+        together,
+        device=device,
         seen=seen,
-    )  # fmt: skip
+    )
 
 
 def excess(codes: Codes, out: Array, first: int) -> str | None:
@@ -148,7 +165,8 @@ def fill_network(
     height, width = codes.shape[1:]
     pieces = cut_pieces(model, height, width, options.bound())
     multiple = int(model.multiple)  # type: ignore[arg-type]
-    apart, done = Disagreement.nothing(height, width), 0
+    apart = Disagreement.nothing(height, width)
+    done = 0
     for tile in pieces.tiles:
         rows, columns = tile.weight.shape
         part = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
@@ -177,9 +195,13 @@ def fill_parts(
     device = next(network.parameters()).device
     dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
     length, height, width = codes.shape
-    part, last, done, top = part_of(network), first + len(out), 0, np.float32(codes.sensor.levels - 1)
+    part = part_of(network)
+    last = first + len(out)
+    done = 0
+    top = np.float32(codes.sensor.levels - 1)
     pieces = cut_pieces(network, height, width, options.bound())
-    apart, known = Disagreement.nothing(height, width), known_of(network, codes)
+    apart = Disagreement.nothing(height, width)
+    known = known_of(network, codes)
     for start in range(first - first % part.kept, last, part.kept):
         end = min(length, start + part.kept + part.after)
         begin = max(0, min(start - part.before, end - 1 - part.after))  # the last frames are reflected at the end
@@ -233,7 +255,8 @@ def padded_frames(codes: Codes, part: tuple[slice, slice], first: int, count: in
     """
     import torch
 
-    length, top = codes.shape[0], codes.sensor.levels - 1
+    length = codes.shape[0]
+    top = codes.sensor.levels - 1
     read = frame_reader(codes)
     for t in reflect(np.arange(first - CONTEXT, first + count + CONTEXT), length):
         yield torch.from_numpy(read(int(t))[part].astype(np.float32) / np.float32(top))[None, None]

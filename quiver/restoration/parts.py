@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 PAST = 10  # frames before a part, where a network sees the complete past: as many as in training
 AROUND = 4  # frames before and after a part, where a network sees the complete clip
-KEPT, KEPT_OF_CLIP = 16, 8  # frames of a part; with AROUND, sixteen frames at a time
+# frames of a part; with AROUND, sixteen frames at a time
+KEPT = 16
+KEPT_OF_CLIP = 8
 KEPT_OF_RECURRENT = 32  # ten frames computed again are a third more work; with 16 they are two thirds
 
 

@@ -55,7 +55,8 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces
     needed = bytes_needed(model, max(height, least), max(width, least))
     if needed <= memory:
         return Pieces(cut_tiles(height, width, height * width, 0))
-    stated, memory = memory, max(memory - weight_bytes(model), 0)
+    stated = memory
+    memory = max(memory - weight_bytes(model), 0)
     pixels = pixels_in(model, memory)
     reach = getattr(model, "reach", None)
     if reach is not None:
@@ -66,7 +67,8 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces
     multiple = int(model.multiple)  # type: ignore[arg-type]
     if not isinstance(model, QUIVER):
         return Pieces(cut_tiles(height, width, pixels, BLENDED, multiple, blend=True), False, needed, stated)
-    step, pixels = max(multiple, model.stride), max(memory - TILING, 0) // bytes_per_pixel(model)
+    step = max(multiple, model.stride)
+    pixels = max(memory - TILING, 0) // bytes_per_pixel(model)
     return Pieces(cut_tiles(height, width, pixels, BLENDED, step, blend=True), False, needed, stated)
 
 
@@ -78,7 +80,8 @@ def bytes_needed(model: nn.Module, height: int, width: int) -> int:
 
 def pixels_in(model: nn.Module, memory: int) -> int:
     """Return the pixels of a tile that `memory` bytes hold beside the weights."""
-    each, pair = bytes_per_pixel(model), bytes_per_pair(model)
+    each = bytes_per_pixel(model)
+    pair = bytes_per_pair(model)
     return math.floor(2 * memory / (each + math.sqrt(each**2 + 4 * pair * memory)))  # of pair n^2 + each n = memory
 
 

@@ -257,18 +257,21 @@ def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, 
         found = read_json(journal)
         for key in ("threads", "device", "look_ahead", "source_sha256"):  # on any device numbers agree to rounding
             found.pop(key, None)
-        done, seconds = int(found.pop("done", 0)), float(found.pop("seconds", 0.0))
+        done = int(found.pop("done", 0))
+        seconds = float(found.pop("seconds", 0.0))
         for key in ("sha256", "checksum"):
             found.pop(key, None)
         if "seconds_per_frame" in found:  # complete: killed before the rename
-            done, seconds = meta["shape"][0], meta["shape"][0] * float(found.pop("seconds_per_frame"))
+            done = meta["shape"][0]
+            seconds = meta["shape"][0] * float(found.pop("seconds_per_frame"))
     except (ValueError, TypeError) as error:
         return 0, 0.0, f"its journal is damaged ({error})"
     changed = [key for key in meta if found.get(key) != meta[key]]
     if not changed and found.keys() == meta.keys():
         return done, seconds, ""
     told = dict.fromkeys(WHAT_CHANGED[key] for key in WHAT_CHANGED if key in changed)
-    before, now = found.get("identity"), meta["identity"]
+    before = found.get("identity")
+    now = meta["identity"]
     if changed == ["identity"] and isinstance(before, dict) and before | {"cut": now["cut"]} == now:
         cuts = [tiles or "none" for tiles in (before.get("cut"), now["cut"])]
         return 0, 0.0, f"the tiles of a frame, by --memory and the device, were {cuts[0]} and are {cuts[1]} now"

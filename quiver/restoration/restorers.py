@@ -109,7 +109,8 @@ def restorers(names: Sequence[str], options: RestoreOptions | None = None) -> li
 
 def weights_path(name: str) -> Path:
     """Return the weights file of a shipped preset, a file or a training folder."""
-    path, shipped = Path(name), shipped_names()
+    path = Path(name)
+    shipped = shipped_names()
     if name in shipped:
         return PRETRAINED / f"{name}.safetensors"
     if path.suffix == ".safetensors":
@@ -159,7 +160,8 @@ def fill_classical(
     block = min(BLOCK_FRAMES, max(1, free // (FRAME_BYTES * height * width)))
     for start in range(first, last, block):
         stop = min(start + block, last)
-        before, after = max(0, start - window), min(length, stop + window)
+        before = max(0, start - window)
+        after = min(length, stop + window)
         wanted = range(start - before, stop - before)
         read = codes.read(before, after)
         taken = [] if codes.shares is None else [np.resize(codes.shares, after)[before:]]

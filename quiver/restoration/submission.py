@@ -57,7 +57,8 @@ def restore_cubes(
             for done, cube in enumerate(cubes):
                 if progress is not None:
                     progress(done, len(cubes))
-                truth, made = cube.truth(), restore_last(cube, method, planes)
+                truth = cube.truth()
+                made = restore_last(cube, method, planes)
                 archive.writestr(zipfile.ZipInfo(f"{cube.name}.png", _DATE), _png(made))
                 scores[cube.name] = None if truth is None else picture_psnr(made, truth)
         known = [score for score in scores.values() if score is not None]

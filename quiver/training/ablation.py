@@ -85,12 +85,14 @@ def markdown(preset: str, rows: Sequence[ComparisonRow]) -> str:
     """Return the paper's table, one line per network and light level: parts, parameters, and means over scenes of the
     PSNR after the best factor and of SSIM.
     """
-    configs, lines = networks(preset), summarise(rows)
+    configs = networks(preset)
+    lines = summarise(rows)
     several = len({line.light for line in lines}) > 1
     header = (*HEADER[:4], "light", *HEADER[4:]) if several else HEADER
     table = []
     for line in lines:
-        psnr, ssim = line.scores["psnr_matched"], line.scores["ssim"]
+        psnr = line.scores["psnr_matched"]
+        ssim = line.scores["ssim"]
         cells = ["yes" if part else "no" for part in ABLATIONS[line.method]]
         cells += [f"{parameter_count(configs[line.method]):,}"]
         cells += [line.light] if several else []

@@ -75,7 +75,8 @@ def make_windows(
     training, validation = split_clips(settings.data, settings.validation_split)
     windows = Windows(training, window, prepare=system.prepare)
     if not validation:
-        names, split = ", ".join(settings.folders), settings.validation_split
+        names = ", ".join(settings.folders)
+        split = settings.validation_split
         warnings.warn(f"{names}: no clip in split '{split}'; validating on training clips", stacklevel=2)
         validation = training
     side = min(VALIDATION_SIDE, *(min(clip.shape[1:]) for clip in validation)) // multiple * multiple
@@ -207,7 +208,9 @@ class Trainer:
 
     def step(self, batch: dict[str, Any]) -> None:
         """Update the weights by one batch; `Diverged` if its loss or gradient is not finite."""
-        settings, state, device = self.run.settings, self.state, self.process.device
+        settings = self.run.settings
+        state = self.state
+        device = self.process.device
         if self.process.world > 1:  # the stored random state is the leader's: every process draws from its samples
             torch.manual_seed(Key(settings.seed, int(batch["sample"][0])).philox_key >> 1)
         self.rate = learning_rate(settings, state)
@@ -226,7 +229,8 @@ class Trainer:
 
     def _fail(self, batch: dict[str, Any], norm: float) -> NoReturn:
         """Save the state before the bad step and stop, naming the samples."""
-        rank, samples = self.process.rank, batch["sample"].tolist()
+        rank = self.process.rank
+        samples = batch["sample"].tolist()
         path = self.run.folder / ("failed.pt" if rank == 0 else f"failed-{rank}.pt")
         self.run.save(path, self.model, self.optimiser, self.state, samples=samples, keys=list(batch["key"]))
         raise Diverged(
@@ -237,7 +241,8 @@ class Trainer:
 
     def validate_if_due(self) -> None:
         """Determine whether the run ends with this step; validate then, and whenever a validation is due."""
-        settings, state = self.run.settings, self.state
+        settings = self.run.settings
+        state = self.state
         out_of_time = self.process.any(time_is_up(settings, state, self.validation))
         state.finished = state.step == settings.steps or out_of_time
         if not self.process.any(validation_due(settings, state)) and not state.finished:
@@ -295,13 +300,15 @@ def train(
     """
     torch.set_flush_denormal(True)  # gradients in the tails of GELU are denormal and slow down a step
     with joined(device) as process, contextlib.ExitStack() as stack:
-        asked, system = settings.threads, system_of(model)
+        asked = settings.threads
+        system = system_of(model)
         system.refuse(model, settings)
         validated = system.validated(model, settings)
         windows: AnyWindows
         fixed: Subset[dict[str, Any]] | None = None
         if system.of_stream:
-            windows, lines = make_stream_windows(settings), ["noise: that of the stream"]
+            windows = make_stream_windows(settings)
+            lines = ["noise: that of the stream"]
             earlier = None if force else threads.recorded(Path(settings.out) / "settings.json")
             settings = replace(settings, threads=threads.use(asked, earlier).number)
         else:

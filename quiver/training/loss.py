@@ -72,7 +72,8 @@ def gradients(image: Tensor, operator: str) -> tuple[Tensor, Tensor]:
 
 def pair_loss(output: Tensor, target: Tensor, loss: Loss) -> Tensor:
     """Return l(a, b) of [..., 1, H, W], a scalar; a gradient without pixels (frames of 1 px) counts as 0."""
-    a, b = output.float().flatten(0, -4), target.float().flatten(0, -4)
+    a = output.float().flatten(0, -4)
+    b = target.float().flatten(0, -4)
     total = (a - b).abs().mean()
     if loss.gradient_weight == 0 or (loss.gradient == "sobel" and min(a.shape[-2:]) < 3):
         return total

@@ -49,7 +49,8 @@ class Process:
 @contextlib.contextmanager
 def joined(device: str) -> Iterator[Process]:
     """Join the process group if torchrun started this process, and leave it at the end."""
-    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    rank = int(os.environ.get("RANK", 0))
+    world = int(os.environ.get("WORLD_SIZE", 1))
     if world > 1:
         torch.distributed.init_process_group(group_backend(device))
     try:

@@ -71,7 +71,9 @@ def emvd_loss(network: Any, batch: Batch, settings: Settings, share: float) -> T
 
     The published program multiplies the wavelet taps without transposing; as published, so do we.
     """
-    table, state, restored = table_of(batch.get("variance"), batch["codes"]), None, []
+    table = table_of(batch.get("variance"), batch["codes"])
+    state = None
+    restored = []
     for image in network.packed(batch["codes"]).unbind(1):
         output, state = network.step(state, image, table)
         restored.append(output)
@@ -97,7 +99,8 @@ def flornn_loss(network: Any, batch: Batch, settings: Settings, share: float) ->
     The published program leaves frame 0 out; as published, so do we. Our flow network learns by a photometric L1 of
     the sharp frames beside: the published one was trained elsewhere.
     """
-    codes, target = batch["codes"], batch["target"]
+    codes = batch["codes"]
+    target = batch["target"]
     flows = network.flows(codes)
     images = codes.expand(-1, -1, network.config.image_channels, -1, -1)
     restored = network.restore(images, network.noise(codes, batch.get("variance")), flows).float()
@@ -106,7 +109,8 @@ def flornn_loss(network: Any, batch: Batch, settings: Settings, share: float) ->
     squares = HALF * (restored[:, first:] - wanted).square().sum() / len(codes)
     if network.flow is None:
         return squares
-    earlier, later = target[:, :-1].flatten(0, 1), target[:, 1:].flatten(0, 1)
+    earlier = target[:, :-1].flatten(0, 1)
+    later = target[:, 1:].flatten(0, 1)
     moved = warp(later, flows.forward.flatten(0, 1).float(), "border")
     back = warp(earlier, flows.backward.flatten(0, 1).float(), "border")
     photometric = (moved - earlier).abs().mean() + (back - later).abs().mean()
@@ -230,7 +234,8 @@ def spk2imgnet_loss(network: Any, batch: Batch, settings: Settings, share: float
     A window with more frames than the network takes gives one restored frame for each place.
     """
     factor = CONVERTER if network.config.as_published else 1.0
-    codes, target = batch["codes"][:, :, 0], batch["target"][:, :, 0]
+    codes = batch["codes"][:, :, 0]
+    target = batch["target"][:, :, 0]
     places = range(codes.shape[1] - network.frames_in + 1)
     total = target.new_zeros(())
     for start in places:

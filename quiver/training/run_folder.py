@@ -125,7 +125,8 @@ class Run:
             raise FileExistsError(f"{folder} exists and is not a training run; choose another -o")
 
     def _check_settings(self) -> None:
-        wanted, found = self.settings.to_dict(), read_json(self.folder / "settings.json")
+        wanted = self.settings.to_dict()
+        found = read_json(self.folder / "settings.json")
         free = {"out", "workers", "threads"}
         for name in wanted:
             if name not in free and _alone(found.get(name)) != _alone(wanted[name]):

@@ -115,8 +115,15 @@ class Settings:
 
 
 # Bundles of defaults, which options override: ours, those of the authors' program, and those of the paper's text.
-_PUBLISHED = {"schedule": "plateau", "warmup": 0, "crop": 128, "reverse": False, "ppp": (3.25,), "bits": (3,),
-              "precision": "float32"}  # fmt: skip
+_PUBLISHED = {
+    "schedule": "plateau",
+    "warmup": 0,
+    "crop": 128,
+    "reverse": False,
+    "ppp": (3.25,),
+    "bits": (3,),
+    "precision": "float32",
+}
 PROTOCOLS: dict[str, dict[str, Any]] = {
     "quick": {"optimiser": "muon", "learning_rate": 6e-3, "loss": "scales-l1", "drift": 3},
     "control": {"loss": "l1"},

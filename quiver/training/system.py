@@ -61,7 +61,8 @@ class System:
 
     def refuse(self, network: nn.Module, settings: Settings) -> None:
         """Raise `ValueError` for settings with which the network cannot be trained."""
-        least, multiple = self.window(network), self.side(network)
+        least = self.window(network)
+        multiple = self.side(network)
         if settings.frames < least:
             raise ValueError(f"--frames must be at least {least}, the window of {self.name}, got {settings.frames}")
         if settings.crop % multiple:
@@ -73,8 +74,10 @@ class System:
         if self.of_stream and settings.schedule == "plateau":
             raise ValueError(f"--schedule plateau: follows validations, and {self.name} has none; leave it out")
         if settings.schedule == "plateau" and settings.steps is None:
-            raise ValueError("--schedule plateau: a run that --minutes ends has ten validations, too few for it; give "
-                             "--steps, or leave it out")  # fmt: skip
+            raise ValueError(
+                "--schedule plateau: a run that --minutes ends has ten validations, too few for it; give "
+                "--steps, or leave it out"
+            )
         self.check(network, settings)
 
 

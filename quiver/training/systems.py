@@ -44,9 +44,19 @@ _PORT: dict[str, Any] = {
     "loss": "own",
     "precision": "float32",
 }
-_FASTDVDNET = {"sensor": "quiver-published", "ppp": (3.25,), "bits": (3,), "force_exposure": True, "reverse": False,
-               "schedule": "plateau", "warmup": 0, "crop": 96, "batch": 64, "steps": 320_000,
-               "precision": "float32"}  # fmt: skip
+_FASTDVDNET = {
+    "sensor": "quiver-published",
+    "ppp": (3.25,),
+    "bits": (3,),
+    "force_exposure": True,
+    "reverse": False,
+    "schedule": "plateau",
+    "warmup": 0,
+    "crop": 96,
+    "batch": 64,
+    "steps": 320_000,
+    "precision": "float32",
+}
 _STREAM: dict[str, Any] = {"frames": 32, "batch": 1, "learning_rate": 2e-4, "clip_norm": 1.0, "loss": "own"}
 _QUICK: dict[str, Any] = {"learning_rate": 1e-3, "loss": "own"}
 
@@ -136,7 +146,7 @@ SYSTEMS: dict[type[nn.Module], System] = {
         _protocols({"frames": 10}, learning_rate=3e-4),
         multiple=4,
     ),
-}  # fmt: skip
+}
 
 
 def system_of(network: nn.Module) -> System:

@@ -83,7 +83,8 @@ def test_neighbours_frames_and_redraws_are_uncorrelated():
 
 
 def test_uniform_numbers_keep_their_digits_at_both_ends():
-    lowest, highest = np.array([0], np.uint32), np.array([2**32 - 1], np.uint32)
+    lowest = np.array([0], np.uint32)
+    highest = np.array([2**32 - 1], np.uint32)
     assert uniform(lowest)[0] == 2.0**-33
     assert 0 < uniform(highest)[0] < 1
     below, above = uniform_pair(lowest, lowest)
@@ -94,7 +95,8 @@ def test_uniform_numbers_keep_their_digits_at_both_ends():
 
 def test_normal_numbers_are_exact_in_both_tails():
     """1 - 2^-65 is 1 as a float64; its number is the mirror of that of 2^-65."""
-    below, above = np.array([2.0**-65, 0.5, 1.0]), np.array([1.0, 0.5, 2.0**-65])
+    below = np.array([2.0**-65, 0.5, 1.0])
+    above = np.array([1.0, 0.5, 2.0**-65])
     z = normal(below, above)
     assert z[1] == 0
     assert z[2] == -z[0]

@@ -97,7 +97,8 @@ def test_a_pipe_or_a_device_is_no_output(tmp_path: Path):
 @pytest.mark.parametrize("kind", ["file", "empty", "link", "pipe", "folder"])
 def test_a_lock_takes_nobody_elses_name(tmp_path: Path, kind: str):
     """The name of a lock is known before: what somebody else put there is refused, not locked, written or deleted."""
-    path, precious = tmp_path / "r.npy.lock", tmp_path / "precious"
+    path = tmp_path / "r.npy.lock"
+    precious = tmp_path / "precious"
     precious.write_bytes(locks.RECORD)
     match kind:
         case "file":

@@ -42,7 +42,8 @@ BOMBS = {  # text of a value -> words of the answer
 
 @pytest.mark.parametrize(("bomb", "words"), BOMBS.items(), ids=["deep", "81 levels", "5000 digits", "400 digits"])
 def test_deep_and_large_values_are_one_line_with_the_place(tmp_path: Path, bomb: str, words: str):
-    toml, description = tmp_path / "a.toml", tmp_path / "a.json"
+    toml = tmp_path / "a.toml"
+    description = tmp_path / "a.json"
     toml.write_text(f"[recipe]\nname = {bomb}\n")
     description.write_text(f'{{"a": 1,\n "b": {bomb}}}')
     for read in (lambda: recipe.load(toml), lambda: files.read_toml(toml, "file")):

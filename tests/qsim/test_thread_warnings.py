@@ -25,7 +25,8 @@ def test_only_the_innermost_block_of_this_thread_acts():
 
 def test_threads_that_cross_leave_each_other_alone():
     """Two blocks that end in the order in which they began, and a thread without a block beside them."""
-    entered, left = threading.Barrier(3), threading.Barrier(3)
+    entered = threading.Barrier(3)
+    left = threading.Barrier(3)
     found = {}
 
     def crossing(name, first):

@@ -8,7 +8,8 @@ from qsim.time_forecast import TimeForecast, duration
 @pytest.mark.parametrize("parts", [1, 4])
 def test_the_time_of_all_steps_and_of_what_precedes_each_part(parts):
     """Two parts of 50 steps of 0.5 s, each after 10 s: said early, once, and within a digit."""
-    said, now = [], [0.0]
+    said = []
+    now = [0.0]
     told = TimeForecast("work", said.append, parts=parts, clock=lambda: now[0])
     for part in range(parts):
         now[0] += 10.0
@@ -20,7 +21,8 @@ def test_the_time_of_all_steps_and_of_what_precedes_each_part(parts):
 
 
 def test_short_work_is_not_announced():
-    said, now = [], [0.0]
+    said = []
+    now = [0.0]
     told = TimeForecast("work", said.append, clock=lambda: now[0])
     for step in range(10):
         now[0] += 1.5

@@ -184,7 +184,9 @@ def test_every_command_that_computes_has_the_option(capsys):
 def test_the_compiled_engine_has_as_many_and_the_next_command_all(tmp_path, monkeypatch, capsys):
     """Inside the command Dr.Jit and its child processes have the number; after it, the number from before."""
     drjit = loaded_drjit()
-    before, seen, plain = drjit.thread_count(), [], sensing.sense
+    before = drjit.thread_count()
+    seen = []
+    plain = sensing.sense
 
     def watched(*args: object, **kwargs: object) -> object:
         seen.append((os.environ.get("QSIM_THREADS"), drjit.thread_count()))

@@ -15,7 +15,8 @@ def test_tiles_cover_the_frame_within_the_bound(blend):
     cut = 0
     for _ in range(60):
         height, width = (int(n) for n in rng.integers(1, 400, 2))
-        multiple, reach = int(rng.choice([1, 4, 8, 16])), int(rng.choice([0, 5, 32, 36]))
+        multiple = int(rng.choice([1, 4, 8, 16]))
+        reach = int(rng.choice([0, 5, 32, 36]))
         pixels = int(rng.integers(1000, 60_000))
         if pixels < min(height, multiple + 80) * min(width, multiple + 80):
             continue  # not even the smallest tile fits

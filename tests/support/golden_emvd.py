@@ -48,7 +48,10 @@ def built(config: EMVDConfig, weights: Mapping[str, Tensor]) -> EMVD:
 def run(network: EMVD, codes: np.ndarray) -> tuple[Tensor, Tensor]:
     """Codes [B, T, 1, H, W] -> outputs and states [B, T, 4, H, W]."""
     images = network.packed(torch.from_numpy(np.asarray(codes, np.float64) / 7))
-    table, state, outputs, states = table_of(None, images), None, [], []
+    table = table_of(None, images)
+    state = None
+    outputs = []
+    states = []
     for image in images.unbind(1):
         output, state = network.step(state, image, table)
         outputs.append(output)
@@ -66,7 +69,10 @@ def recorded(network: EMVD, codes: np.ndarray) -> dict[str, Tensor]:
     result = {"output": output, "state": states}
     if codes.shape[1] < 3:
         return result
-    old, new, images = calls["bands"][12:15], calls["bands"][15:18], calls["image"][8:12]  # 6 and 4 calls per frame
+    # 6 and 4 calls per frame
+    old = calls["bands"][12:15]
+    new = calls["bands"][15:18]
+    images = calls["image"][8:12]
     result |= {"haar0_old_t2": old[0], "up2_t2": images[0], "omega_t2": calls["omega"][2]}
     for scale in range(3):
         fused = calls[str(scale)][2]

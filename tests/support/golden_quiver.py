@@ -46,7 +46,9 @@ def recorded(model: QUIVER, codes: np.ndarray) -> dict[str, Tensor]:
     out = model(torch.from_numpy(codes).to(dtype) / 7)
     for hook in hooks:
         hook.remove()
-    batch, t5 = len(codes), 4  # frame 0 alone and first, then frames 1 .. T-1 in groups
+    # frame 0 alone and first, then frames 1 .. T-1 in groups
+    batch = len(codes)
+    t5 = 4
     flow1, flow2, flow4 = (in_time([flows[s] for flows in calls["flow"]], batch).flatten(0, 1) for s in range(3))
     return {
         "denoised": out.denoised,

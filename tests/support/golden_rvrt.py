@@ -41,7 +41,8 @@ def recorded(network: RVRT, frames: Tensor) -> dict[str, Tensor]:
     """All stages of a run on frames [B, T, 1, H, W], T even."""
     main = network.backbone["backward_1"].main
     layers = list(main["5"][0].residual_group["blocks"])
-    align, last = network.deform_align["backward_1"], network.deform_align["forward_2"]
+    align = network.deform_align["backward_1"]
+    last = network.deform_align["forward_2"]
     calls = Recorder(
         {"flow": network.spynet, "ln": main["3"], "layer0": layers[0], "layer1": layers[1], "block0": main["5"][0],
          "stack": network.backbone["backward_1"], "raw": align.conv_offset, "align": align, "last": last,
@@ -87,7 +88,8 @@ def aligned(calls: Recorder, seen: Tensor, width: int) -> dict[str, Tensor]:
 
 def beginning(codes: np.ndarray, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The stages up to the first alignment, from the frames that they need alone, for a quick test."""
-    network, frames = built(weights), torch.from_numpy(np.asarray(codes, np.float64) / 7)
+    network = built(weights)
+    frames = torch.from_numpy(np.asarray(codes, np.float64) / 7)
     last = frames[:, -2 * CLIP :]
     shallow = network.shallow(last.flatten(0, 1)).unflatten(0, last.shape[:2])
     steps = network.flows(last)[0].flip(1)

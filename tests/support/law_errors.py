@@ -15,7 +15,8 @@ def errors(sensor, photons: float, pmf: list, slope: list) -> np.ndarray:
     pmf = [*pmf, *[mp.mpf(0)] * sensor.levels]
     pmf = [*pmf[:top], mp.fsum(pmf[top:])]
     cdf, log_pmf, dcdf = (f(photons, EXPOSURE) for f in (sensor.cdf, sensor.log_pmf, sensor.dcdf))
-    worst, total = np.zeros(3), mp.mpf(0)
+    worst = np.zeros(3)
+    total = mp.mpf(0)
     for k in range(sensor.levels):
         total += pmf[k]
         worst[0] = max(worst[0], abs(float(cdf[k] - total)))

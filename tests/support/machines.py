@@ -59,7 +59,8 @@ def walk(terms: int, dtype: Any) -> float:
 def standard_errors(values: Any, low: Any, high: Any) -> Array:
     """Standard errors of values that have intervals of 95 %; of an interval without an end, twice the other side."""
     values, low, high = (np.asarray(v, float) for v in (values, low, high))
-    below, above = values - low, high - values
+    below = values - low
+    above = high - values
     below, above = np.where(np.isfinite(below), below, above), np.where(np.isfinite(above), above, below)
     return np.where(np.isfinite(below), below + above, 0.0) / INTERVAL
 
@@ -147,7 +148,8 @@ Result = Sums | Fits | Rendered | ErrorsOfLight
 
 def difference(result: Result, wanted: Array, errors: Array | None = None) -> str | None:
     """What is wrong with a result, as text, or None; `errors` are stored standard errors of fits."""
-    found, wanted = np.asarray(result.values, float), np.asarray(wanted, float)
+    found = np.asarray(result.values, float)
+    wanted = np.asarray(wanted, float)
     if wanted.shape != found.shape:
         return f"shape {found.shape} instead of {wanted.shape}"
     finite = np.isfinite(wanted)

@@ -10,8 +10,10 @@ def paralyzable_oracle(arrivals, share: float, most: int | None = None) -> list:
 
     The last moment may be `most` where so many counts hardly ever occur.
     """
-    arrivals, a = mp.mpf(arrivals), mp.mpf(share)
-    rate, most = arrivals * mp.e ** (-arrivals * a), most or int(mp.floor(1 / a)) + 1
+    arrivals = mp.mpf(arrivals)
+    a = mp.mpf(share)
+    rate = arrivals * mp.e ** (-arrivals * a)
+    most = most or int(mp.floor(1 / a)) + 1
     moments = [mp.mpf(1)]
     for j in range(1, most + 1):
         c = 1 - (j - 1) * a

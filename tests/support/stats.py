@@ -47,7 +47,8 @@ def assert_variance(
     n = sample.size
     found = float(np.var(sample, ddof=1, dtype=np.float64))
     sigma = sqrt((fourth_moment - variance**2 * (n - 3) / (n - 1)) / n)
-    z, limit = (found - variance) / sigma, critical_z(false_alarm, checks)
+    z = (found - variance) / sigma
+    limit = critical_z(false_alarm, checks)
     assert abs(z) < limit, (
         f"variance {found:.8g}, expected {variance:.8g} +- {sigma:.2g}: z = {z:.1f}, limit {limit:.1f}"
     )
@@ -61,7 +62,8 @@ def assert_same_rms(
     means = [float(square.mean()) for square in squares]
     assert min(means) > 0, "a sample without errors has no rms to compare"
     sigma = sqrt(sum(float(s.var()) / s.size / m**2 for s, m in zip(squares, means, strict=True))) / 2
-    z, limit = log(means[0] / means[1]) / 2 / sigma, critical_z(false_alarm, checks)
+    z = log(means[0] / means[1]) / 2 / sigma
+    limit = critical_z(false_alarm, checks)
     found = f"rms {sqrt(means[0]):.4g} and {sqrt(means[1]):.4g}, their ratio known to {sigma:.2g}"
     assert abs(z) < limit, f"{found}: z = {z:.1f}, limit {limit:.1f}"
 
@@ -81,9 +83,13 @@ def histogram_p_value(codes: np.ndarray, pmf: np.ndarray, fitted: int = 0) -> fl
     if counts.size > pmf.size or counts[pmf == 0].any():
         return 0.0
     expected = pmf * codes.size
-    observed_bins, expected_bins, o, e = [], [], 0.0, 0.0
+    observed_bins = []
+    expected_bins = []
+    o = 0.0
+    e = 0.0
     for c, x in zip(counts, expected, strict=True):
-        o, e = o + c, e + x
+        o = o + c
+        e = e + x
         if e >= 5:
             observed_bins.append(o)
             expected_bins.append(e)
@@ -114,7 +120,8 @@ def mixture_p_value(codes: np.ndarray, pmf: np.ndarray) -> float:
     """
     observed = np.bincount(codes.ravel(), minlength=pmf.shape[1]).astype(float)
     chances = pmf.reshape(-1, pmf.shape[-1])
-    groups, current = [], []
+    groups = []
+    current = []
     for k, expected in enumerate(chances.sum(axis=0)):
         current.append((k, expected))
         if sum(e for _, e in current) >= 5:

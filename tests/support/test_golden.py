@@ -59,7 +59,8 @@ def quiver_codes(*shape: int) -> dict[str, np.ndarray]:
 
 @pytest.mark.slow
 def test_the_program_prints_errors(tmp_path, capsys):
-    small, table = tmp_path / "small.npz", DATA / "published_state_dict.tsv"
+    small = tmp_path / "small.npz"
+    table = DATA / "published_state_dict.tsv"
     cut(DATA / "golden_quiver_c16.npz", small, ["codes", "flow4", "out1"])
     assert main(["quiver", str(small), str(table)]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -68,7 +69,8 @@ def test_the_program_prints_errors(tmp_path, capsys):
 
 
 def test_the_program_fails_on_missing_keys(tmp_path, capsys):
-    small, table = tmp_path / "small.npz", DATA / "published_state_dict.tsv"
+    small = tmp_path / "small.npz"
+    table = DATA / "published_state_dict.tsv"
     np.savez(small, **quiver_codes(1, 11, 1, 16, 16), strange=np.zeros(3))
     assert main(["quiver", str(small), str(table), "--prefix", "x."]) == 1
     assert json.loads(capsys.readouterr().out) == {"strange": None}
@@ -113,11 +115,13 @@ def write_table(network: torch.nn.Module, path: Path) -> Path:
 @pytest.mark.parametrize(("name", "size"), [(name, size) for name, (_, sizes) in OTHERS.items() for size in sizes])
 def test_files_of_other_sizes_widths_and_prefixes(tmp_path, capsys, name, size):
     """Two clips together have the stages of each alone; other weights have others."""
-    table, path = write_table(OTHERS[name][0](), tmp_path / "t.tsv"), tmp_path / "g.npz"
+    table = write_table(OTHERS[name][0](), tmp_path / "t.tsv")
+    path = tmp_path / "g.npz"
     batch, frames, height, width = size
     arrays = {"codes": np.random.default_rng(5).integers(0, 8, (batch, frames, 1, height, width), dtype=np.uint8)}
     arrays |= flows(*size) if name == "flornn" else {}
-    network, weights = importlib.import_module(f"golden_{name}"), weights_by_table(table, "p.")
+    network = importlib.import_module(f"golden_{name}")
+    weights = weights_by_table(table, "p.")
     with torch.no_grad():
         alone = [network.stages({k: a[i : i + 1] for k, a in arrays.items()}, weights) for i in range(batch)]
     np.savez(path, **arrays, **{key: np.concatenate([stages[key].numpy() for stages in alone]) for key in alone[0]})
@@ -217,7 +221,8 @@ def test_files_that_cannot_be_compared_are_one_line(tmp_path, capsys):
 @pytest.mark.slow
 def test_groups_of_frames_change_no_stage(monkeypatch):
     """Large frames run in groups; the stages of a clip are the same."""
-    golden, table = quiver_codes(2, 13, 1, 20, 36), DATA / "published_state_dict.tsv"
+    golden = quiver_codes(2, 13, 1, 20, 36)
+    table = DATA / "published_state_dict.tsv"
     from golden_quiver import stages
 
     weights = weights_by_table(table)

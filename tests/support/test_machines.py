@@ -41,7 +41,8 @@ def test_sums_in_another_order_are_within_the_rule():
 
 def test_fits_may_differ_by_a_thousandth_of_their_own_standard_error():
     values = np.array([1.0, 2.0, 3.0])
-    low, high = np.array([0.9, 1.8, -np.inf]), np.array([1.1, np.inf, np.inf])
+    low = np.array([0.9, 1.8, -np.inf])
+    high = np.array([1.1, np.inf, np.inf])
     errors = standard_errors(values, low, high)
     np.testing.assert_allclose(errors, [0.2 / 3.919928, 0.4 / 3.919928, 0.0], rtol=1e-6)
     for factor, same in ((0.5, True), (2.0, False)):

@@ -9,7 +9,9 @@ from qsim.clip.clip import Clip
 from qsim.clip.manifest import PHYSICAL
 from qsim.clip.writer import ClipWriter
 
-FRAMES, HEIGHT, WIDTH = 5, 10, 7
+FRAMES = 5
+HEIGHT = 10
+WIDTH = 7
 CAMERA = {
     "kind": "Camera",
     "focal_length": 8e-3,

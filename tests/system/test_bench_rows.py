@@ -28,7 +28,9 @@ def test_rows_are_made_once_and_shown(tmp_path, capfd):
     assert capfd.readouterr().out == ""
     page = out.with_suffix(".md").read_text()
     row = json.loads((out / "emvd.json").read_text())["costs"][0]
-    taken, memory, macs = row["seconds_per_frame"], row["peak_bytes"] / 1e6, row["gmac_per_frame"]
+    taken = row["seconds_per_frame"]
+    memory = row["peak_bytes"] / 1e6
+    macs = row["gmac_per_frame"]
     line = re.search(r"\| emvd(?:\\\*)? \| ([^|]+) \| ([^|]+) \| ([^|]+) \| ([^|]+) \|", page)
     assert line is not None
     assert line.groups() == (f"{taken:.3g}", f"{1 / taken:.3g}", f"{memory:.0f}", f"{float(f'{macs:.3g}'):g}")

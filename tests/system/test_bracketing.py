@@ -33,7 +33,8 @@ def test_the_recipe_goes_from_rendering_to_the_report(tmp_path, capsys):
         command = ["restore", str(clip.path / "streams" / f"{name}.json"), "--method", "likelihood", "-o", path]
         assert quiver.cli.program.main(command) == 0
         found[name] = np.load(path)
-    truth, white = stream.truth(), stream.sensor.white(stream.exposure)
+    truth = stream.truth()
+    white = stream.sensor.white(stream.exposure)
     bright = truth > 2 * white
     error = {name: np.median(np.abs(video / truth - 1)[bright]) for name, video in found.items()}
     assert error["bracketed"] < 0.5 * error["full"]

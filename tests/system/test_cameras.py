@@ -28,7 +28,8 @@ Drawn = tuple[Clip, Sensor, dict[str, Any]]
 def random_case(folder: Path, rng: np.random.Generator) -> Drawn:
     """A clip of odd size, grey or in colour, under light that flickers; a sensor; settings that may not fit."""
     height, width, frames = (int(n) for n in rng.integers(1, (20, 20, 20)))
-    colour, seeds = rng.random() < 0.5, (1, 2, 3)
+    colour = rng.random() < 0.5
+    seeds = (1, 2, 3)
     strength = 1 + 0.8 * np.sin(np.arange(frames) * rng.uniform(0, 3))
     light = np.stack([sliding_pattern(frames, height, width, seed) for seed in seeds[: 3 if colour else 1]], axis=1)
     light = (light**3 * strength[:, None, None, None] * rng.uniform(0.2, 1, (light.shape[1], 1, 1))).astype(np.float32)
@@ -59,7 +60,8 @@ def random_case(folder: Path, rng: np.random.Generator) -> Drawn:
 
 
 def random_sensor(rng: np.random.Generator) -> tuple[Sensor, dict[str, Any]]:
-    share, dark = rng.uniform(0.2, 1), rng.uniform(0, 300)
+    share = rng.uniform(0.2, 1)
+    dark = rng.uniform(0, 300)
     kind = rng.integers(4)
     if kind == 0:
         noise = float(rng.choice([0.0, 0.2, 3.0]))
@@ -78,7 +80,8 @@ def random_sensor(rng: np.random.Generator) -> tuple[Sensor, dict[str, Any]]:
 def interval(light: np.ndarray, start: np.ndarray) -> np.ndarray:
     """The light [H, W] of each pixel from time `start` [H, W] on, one frame long, by its integral over time."""
     total = np.concatenate([np.zeros((1, *light.shape[1:])), np.cumsum(light, axis=0)])
-    times, found = np.arange(len(light) + 1), np.empty(start.shape)
+    times = np.arange(len(light) + 1)
+    found = np.empty(start.shape)
     for y, x in np.ndindex(*start.shape):
         found[y, x] = np.diff(np.interp([start[y, x], start[y, x] + 1], times, total[:, y, x]))[0]
     return found
@@ -90,7 +93,8 @@ def departure(clip: Clip, stream: Stream, how: dict[str, Any]) -> float:
     Light and law are computed from the settings here. Weights: even, down, across, as a chessboard, by light and its
     change, by exposure.
     """
-    sensor, planes = stream.sensor, stream.meta["planes_per_code"]
+    sensor = stream.sensor
+    planes = stream.meta["planes_per_code"]
     diffraction = how["diffraction"]
     light = np.stack([clip_photons(clip, t, stream.photons_factor, diffraction=diffraction) for t in range(len(clip))])
     height, width = clip.shape[1:]
@@ -104,7 +108,8 @@ def departure(clip: Clip, stream: Stream, how: dict[str, Any]) -> float:
         line = {"down": y, "up": height - 1 - y, "right": x, "left": width - 1 - x}[how["rows"].order]
         late = line * how["rows"].delay * RATE
     shares = how.get("exposures", (1.0,))
-    residuals, variances = [], []
+    residuals = []
+    variances = []
     for t, code in enumerate(stream.codes()):
         share = shares[t % len(shares)]
         each = [interval(light, t * planes + n + late) for n in range(planes)]
@@ -112,12 +117,14 @@ def departure(clip: Clip, stream: Stream, how: dict[str, Any]) -> float:
             plane = dataclasses.replace(sensor, bits=1)
             laws = [(plane, share * one, share * clip.exposure) for one in each]
         else:
-            opens, shuts = planes * (1 - share) / 2, planes * (1 + share) / 2
+            opens = planes * (1 - share) / 2
+            shuts = planes * (1 + share) / 2
             seen = sum(max(0.0, min(shuts, n + 1) - max(opens, n)) * one for n, one in enumerate(each))
             laws = [(sensor, seen, share * planes * clip.exposure)]
         residuals.append(code - sum(law.mean(photons, time) for law, photons, time in laws))
         variances.append(sum(law.variance(photons, time) for law, photons, time in laws))
-    residual, variance = np.array(residuals), np.array(variances)
+    residual = np.array(residuals)
+    variance = np.array(variances)
     odd = 1 - 2 * ((y + x) % 2)
     bright = light[: planes * len(residual)].reshape(-1, planes, height, width).mean(axis=1)
     change = np.gradient(bright, axis=0) if len(bright) > 1 else np.zeros_like(bright)

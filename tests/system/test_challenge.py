@@ -30,7 +30,8 @@ def small(frames: int, height: int, width: int, grey: bool = False) -> str:
 
 def to_submission(folder: Path, method: str) -> dict[str, object]:
     """Check a data set, write its cubes, restore those of the test split, and report; return the description."""
-    data, out = folder / "data", folder / "cubes"
+    data = folder / "data"
+    out = folder / "cubes"
     assert main(["check", str(data)]) == 0
     assert main(["convert", str(data), str(out), "--to", "challenge", "--window", "64"]) == 0
     line = ["restore", str(out / "test"), "-o", str(folder / "s.zip"), "--planes", "3", "--method", method]

@@ -69,7 +69,8 @@ def test_errors_in_both_units():
     truth[0, 0] = 100
     picture = truth + np.where(truth > 1, 1.0, 0.01)
     found = clip_rows.reached(picture, np.stack([truth, truth]))
-    dim, bright = 0.99 * 0.01**2, 0.01 * 1.0**2
+    dim = 0.99 * 0.01**2
+    bright = 0.01 * 1.0**2
     assert found["white"] == pytest.approx(20 * np.log10(2.5 * 1.99 / np.sqrt(dim)), abs=0.006)
     assert found["peak"] == pytest.approx(20 * np.log10(100 / np.sqrt(dim + bright)), abs=0.006)
 

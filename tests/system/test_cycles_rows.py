@@ -66,7 +66,8 @@ def test_a_neutral_file_places_every_vertex_where_the_scene_has_it(tmp_path, fam
     assert (description["height"], description["width"], description["frames"]) == (24, 40, 3)
     assert len(description["bodies"]) == len(scene.bodies)
     for i, body in enumerate(scene.bodies):
-        vertices, faces = arrays[f"body{i}_vertices"], arrays[f"body{i}_faces"]
+        vertices = arrays[f"body{i}_vertices"]
+        faces = arrays[f"body{i}_faces"]
         assert set(map(tuple, faces.tolist())) <= set(map(tuple, body.mesh.faces.tolist()))
         for t, camera, pose in zip(TIMES, arrays["cameras"], arrays[f"body{i}_poses"], strict=True):
             world = vertices @ pose[:3, :3].T + pose[:3, 3]
@@ -143,7 +144,8 @@ def test_a_map_of_surroundings_is_what_our_renderer_sees(rotation, target):
     seen = renderer.halves([0.0], renderer.budget, renderer.key(0)).mean(axis=0)
     found = cycles_scene.finer_map(picture, rotation)
     direction = camera.directions() @ camera.pose()[:3, :3].T
-    azimuth, up = np.arctan2(direction[..., 0], direction[..., 2]), direction[..., 1]
+    azimuth = np.arctan2(direction[..., 0], direction[..., 2])
+    up = direction[..., 1]
     zenith = np.arccos(up / np.linalg.norm(direction, axis=-1))
     height, width = found.shape
     rows = np.clip(np.floor(zenith / np.pi * height).astype(int), 0, height - 1)

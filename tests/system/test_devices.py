@@ -27,7 +27,8 @@ def test_devices_are_named_in_one_place_of_each_package():
     found = {}
     for package, place in PLACES.items():
         for path in sorted((ROOT / package).rglob("*.py")):
-            name, lines = path.relative_to(ROOT).as_posix(), list(named(path.read_text(encoding="utf-8")))
+            name = path.relative_to(ROOT).as_posix()
+            lines = list(named(path.read_text(encoding="utf-8")))
             if name == place:
                 assert lines
             elif lines:

@@ -119,7 +119,8 @@ def test_streams_are_learned_and_restored_without_a_gpu(tmp_path, monkeypatch):
     """As the rows beside them."""
     from clips import write_clip
 
-    asked, devices = {}, []
+    asked = {}
+    devices = []
     monkeypatch.setattr(stream_rows, "quiver", lambda *words, budget: asked.update(pairwise(words)))
     monkeypatch.setattr(stream_rows, "restorer", lambda name, options: devices.append(options.device))
     monkeypatch.setattr(stream_rows, "restore_clip", lambda *words: None)
@@ -386,7 +387,8 @@ def test_rows_are_made_once_and_shown(tmp_path):
     from clips import write_dataset
 
     data = write_dataset(tmp_path / "data", {"train": 2, "val": 1, "test": 2})
-    out, work = tmp_path / "rows", tmp_path / "work"
+    out = tmp_path / "rows"
+    work = tmp_path / "work"
     common = [data, "--tiny", "--out", out, "--work", work]
     first = run(*common, "--rows", "classical,unet")
     assert first.returncode == 0, first.stderr

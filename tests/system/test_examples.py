@@ -67,7 +67,8 @@ def test_every_picture_belongs_to_an_example():
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_pages_and_notebooks_hold_the_cells_and_the_results(path):
-    page, book = examples.page(path.stem), examples.notebook(path.stem)
+    page = examples.page(path.stem)
+    book = examples.notebook(path.stem)
     assert page.startswith("# ")
     assert f"{path.stem}.ipynb" in page
     assert "# tests:" not in page

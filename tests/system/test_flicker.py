@@ -23,7 +23,8 @@ def test_the_recipe_goes_from_rendering_to_the_report(tmp_path, capsys):
     folder = tmp_path / "out"
     assert qsim.cli.program.main(["generate", str(tmp_path / "flicker.toml"), "-o", str(folder)]) == 0
     clip = Clip.open(folder / "clips" / "mains_0001_x8")
-    tube, led = clip.strengths["light1"], clip.strengths["light2"]
+    tube = clip.strengths["light1"]
+    led = clip.strengths["light2"]
     assert len(tube) == len(led) == 9
     assert np.ptp(led) > 0.5  # switched off in some frames
     brightness = np.array([frame.mean() for frame in clip])

@@ -43,7 +43,9 @@ from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes
 
 MEMORY = 400 << 20  # bytes that a reader of these tiny files may take at most
-T, H, W = 4, 6, 16
+T = 4
+H = 6
+W = 16
 
 
 def some_planes() -> np.ndarray:
@@ -311,7 +313,8 @@ def npy(array: np.ndarray) -> bytes:
 
 def other_kinds() -> dict[str, bytes]:
     """Contents that do not belong under a name: files of other kinds, arrays that are none, headers that lie."""
-    archive, header = io.BytesIO(), io.BytesIO()
+    archive = io.BytesIO()
+    header = io.BytesIO()
     np.savez(archive, a=np.zeros(3))
     np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (1 << 40, 6, 2)})
     flat = npy(np.zeros((4, 6, 2), np.uint8))

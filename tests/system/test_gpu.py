@@ -354,7 +354,8 @@ def test_killed_at_any_moment_it_continues_and_leaves_no_process(bench):
 def test_ctrl_c_ends_the_measurement_and_prints_one_line(bench):
     bench.acts(doctor_machine=60)
     process = _start(bench)
-    made, end = bench.folder / "made.txt", time.monotonic() + 30
+    made = bench.folder / "made.txt"
+    end = time.monotonic() + 30
     while not made.exists() and time.monotonic() < end:
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
@@ -575,7 +576,8 @@ def _sensor(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
             assert row.get("Gpixel/s", 1) > 0
     assert {row["by"] for found in rows.values() for row in found} >= {"numpy", "llvm", "torch, cpu"}
     assert rows["engine-llvm"][4]["all checks"] == "passed"
-    numpy, torchs = rows["engine-llvm"][0]["Gpixel/s"], rows["torch-cpu"][0]["Gpixel/s"]
+    numpy = rows["engine-llvm"][0]["Gpixel/s"]
+    torchs = rows["torch-cpu"][0]["Gpixel/s"]
     assert 0.01 < numpy / torchs < 100  # one unit: both draw one number of Poisson per pixel
     assert list(rows["torch-cpu"][0]) == ["by", "what", "Gpixel/s", "times NumPy", "differing per million"]
 

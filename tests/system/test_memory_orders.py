@@ -124,7 +124,8 @@ def test_counts_in_any_order_are_read_as_plain_ones(tmp_path: Path):
     counts = RNG.integers(1, 9, (4, 3, 5, 6)).astype(np.int64)
     np.save(tmp_path / "plain.npy", counts)
     np.save(tmp_path / "other.npy", np.asfortranarray(counts.astype(">i8")))
-    one, two = read_counts(tmp_path / "plain.npy"), read_counts(tmp_path / "other.npy")
+    one = read_counts(tmp_path / "plain.npy")
+    two = read_counts(tmp_path / "other.npy")
     assert same(one.frames, two.frames)
     assert same(one.shares, two.shares)
     assert two.frames.flags.c_contiguous

@@ -45,7 +45,8 @@ def test_from_the_recipe_to_a_comparison(tmp_path, capsys):
     clip = Clip.open(tmp_path / "data" / "clips" / "text_0000")
     assert set(compared(clip.path, capsys)) == {"", "spike", "conventional", "quanta"}
     assert main(["convert", str(clip.path / "streams" / "spike.json"), str(tmp_path / "spike.dat")]) == 0
-    spike, conventional = clip.stream("spike"), clip.stream("conventional")
+    spike = clip.stream("spike")
+    conventional = clip.stream("conventional")
     assert (len(spike), len(conventional)) == (24, 2)
     assert conventional.exposure == pytest.approx(12 * spike.exposure)
     assert conventional.photons_factor == pytest.approx(spike.photons_factor)

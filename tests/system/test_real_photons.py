@@ -111,7 +111,8 @@ def test_the_three_bit_mean_of_real_photons_is_that_of_our_sensor(gates):
     share, total = given_total(gates)
     totals, pixels = np.unique(total, return_counts=True)
     weights = pixels / total.size
-    expected, variance = [], []
+    expected = []
+    variance = []
     for s in share:
         mean = totals * s
         closed, up, down = (ideal.mean(np.maximum(mean + d, 0), 1.0) for d in (0.0, 0.05, -0.05))
@@ -214,7 +215,8 @@ def test_a_measured_dark_map_serves_as_a_sensor():
 
     rates = -np.log1p(-dark_counts() / FRAMES)
     mean, relative = measured_dark_map(rates)
-    exposure, planes = 10.3e-6, 800
+    exposure = 10.3e-6
+    planes = 800
     sensor = BinarySPAD(0.5, mean / exposure)
     codes = PixelArray(sensor, Maps(dark=relative)).sample(
         np.zeros((planes, 50, 50), np.float32), exposure, key=Key(1, 2)

@@ -58,7 +58,8 @@ def test_hostile_names_and_splits_leave_the_output_folder_alone(
 ):
     """In every place that becomes a path: name and split of a clip, names and splits of jobs, of a record's streams."""
     monkeypatch.chdir(data.parent)
-    manifest, about = data / "dataset.json", data / "clips" / "fan_0000" / "clip.json"
+    manifest = data / "dataset.json"
+    about = data / "clips" / "fan_0000" / "clip.json"
     record = data / "jobs" / "fan_0000.json"
 
     def job(found: dict, key: object) -> None:
@@ -83,7 +84,8 @@ def test_hostile_names_and_splits_leave_the_output_folder_alone(
         "qsim check data",
         "qsim sense data --ppp 1 --bits 2",
     ]
-    wanted, repair = recipe.load(data.parent / "r.toml"), generation.Options(workers=0, repair=True)
+    wanted = recipe.load(data.parent / "r.toml")
+    repair = generation.Options(workers=0, repair=True)
     before = outside(data.parent)
     content = {path: path.read_bytes() for path in (manifest, about, record)}
     for path, change in attacks:

@@ -52,7 +52,8 @@ def test_the_page_tells_the_best_depth(tmp_path, monkeypatch):
     monkeypatch.setattr(restorer_bits, "BITS", (1, 3))
     monkeypatch.setattr(restorer_bits, "LIGHTS", (0.5, 2.0))
     monkeypatch.setattr(restorer_bits, "MOTION", (0.0, 4.0))
-    still, moving = {"0.5": (20.0, 24.0), "2": (21.0, 26.0)}, {"0.5": (22.0, 21.5), "2": (25.0, 23.0)}
+    still = {"0.5": (20.0, 24.0), "2": (21.0, 26.0)}
+    moving = {"0.5": (22.0, 21.5), "2": (25.0, 23.0)}
     rows = {
         motion: [{f"{bits} bits, {p} PPP": {"psnr": told[p][i]} for p in told for i, bits in enumerate((1, 3))}]
         for motion, told in (("0", still), ("4", moving))

@@ -59,11 +59,15 @@ def points_on(body: Body, count: int, rng: np.random.Generator) -> tuple[np.ndar
 
 def image_motion(scene: Scene, times: tuple[float, ...] = (0.002, 0.008), count: int = 800) -> float:
     """Return the mean motion [px/frame] of moving points in view, weighted by image area; occlusion is ignored."""
-    rng, camera, speeds, weights = np.random.default_rng(9), scene.camera, [], []
+    rng = np.random.default_rng(9)
+    camera = scene.camera
+    speeds = []
+    weights = []
     for body in scene.bodies:
         faces, share, surface = points_on(body, count, rng)
         for t in times:
-            pixels, z = [], []
+            pixels = []
+            z = []
             for instant in (t, t + 1 / FRAME_RATE):
                 corner = vertices_in_world(body, instant)[body.mesh.faces[faces]]
                 p, depth = camera.project(np.einsum("nk,nki->ni", share, corner), instant)
@@ -145,7 +149,8 @@ def test_other_seeds_differ_in_layout_and_texture_and_light(family):
 @pytest.mark.parametrize("family", SOME_FAMILIES)
 def test_twice_the_speed_moves_as_far_in_half_the_time(family):
     """Steps from time 0 in body coordinates; gravity does not scale and moves 5 um in a frame."""
-    once, twice = built(family, 0), built(family, 0, 2.0)
+    once = built(family, 0)
+    twice = built(family, 0, 2.0)
     step = 1 / FRAME_RATE
     moving = 0
 
@@ -177,7 +182,8 @@ def test_the_camera_of_a_close_up_never_rests():
     camera = built("macro", 0, 40.0).camera
     places = np.array([camera.pose(t / FRAME_RATE)[:3, 3] for t in range(200)])
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).min() > 1e-3  # m
-    motion, step = camera.motion, macro.STEP / 40
+    motion = camera.motion
+    step = macro.STEP / 40
     for turn in (11, 22, 23, 44, 45):
         before, after = (motion.velocity((turn + side) * step)[0] for side in (-1e-6, 1e-6))
         np.testing.assert_allclose(before, after, atol=0.01)  # m/s, of 20 to 50

@@ -49,7 +49,9 @@ USED = {"drums_0000": 3240, "fan_0000": 1080}  # processor seconds of the clips 
 
 def make(job: Job, path: Path) -> Clip:
     """Make a clip of stripes, whose left half moves by 2 px/frame."""
-    frames, height, width = job.settings.frames, job.settings.height, job.settings.width
+    frames = job.settings.frames
+    height = job.settings.height
+    width = job.settings.width
     camera = describe(Camera(8e-3, 2.8, 1.1e-6, height, width))
     meta = {"shape": [frames, height, width], "frame_rate": 2000.0, "shutter": 0.0, "exposure": 5e-4}
     meta |= {"radiance_unit": PHYSICAL, "camera": camera, "render": {"samples": 8, "neighbours": 3}}
@@ -247,7 +249,8 @@ def unfinished(place: Path) -> Path:
 
 def test_files_of_another_recipe_are_refused(place, capsys):
     """A plan of a shard is none of the recipe; one with reuse is none without; a data set holds other settings."""
-    tiny, shared = plan(place, capsys, "tiny"), plan(place, capsys, "shared")
+    tiny = plan(place, capsys, "tiny")
+    shared = plan(place, capsys, "shared")
     shard = plan(place, capsys, "tiny", "--shard", "1/3")
     for option, path in (("--alone", shared), ("--reuse", tiny), ("--alone", shard), ("--shard-plan", tiny)):
         assert f"{path}: is not the plan of " in refused(place, capsys, option, path)

@@ -96,7 +96,8 @@ def numbers(tree: Any) -> Iterator[float]:
 def moving(frames: int, height: int, width: int, seed: int) -> Array:
     """Radiance [T, H, W] from whole numbers alone: blocks and stripes in 64ths, and a bright square that moves."""
     t, y, x = np.mgrid[:frames, :height, :width]
-    right, down = x - 2 * t + 5 * seed, y - t + 3 * seed
+    right = x - 2 * t + 5 * seed
+    down = y - t + 3 * seed
     light = 16 + (7 * (right // 3) + 5 * (down // 4)) % 64 + 8 * ((right + 2 * down) % 5)
     return (light + 96 * ((right % width < width // 4) & (y % height > height // 2))) / 64
 
@@ -164,7 +165,8 @@ def light_for(sensor: Sensor) -> Array:
 
 def _codes(engine: str) -> Results:
     for i, sensor in enumerate(SENSORS):
-        key, origin = KEYS[i % len(KEYS)], ORIGINS[i // 2 % len(ORIGINS)]
+        key = KEYS[i % len(KEYS)]
+        origin = ORIGINS[i // 2 % len(ORIGINS)]
         photons = light_for(sensor)
         codes = sensor.sample(photons, 5e-4, key=key, origin=origin, engine=engine)
         yield f"{i} {sensor!r}", checksum(codes)

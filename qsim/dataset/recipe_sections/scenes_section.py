@@ -17,16 +17,25 @@ from qsim.structure import Check, Table
 
 MAX_STEM = 180  # characters of a scene's name, which gets a seed, a speed and a temporary ending as a file's name
 SETTINGS: dict[str, Check] = {
-    "frames": checks.whole, "height": checks.whole, "width": checks.whole,
-    "frame_rate": checks.frame_rate, "shutter": checks.shutter, "psnr": checks.psnr,
-    "bands": checks.bands, "camera_path": checks.text, "reuse": checks.flag,
-}  # fmt: skip
+    "frames": checks.whole,
+    "height": checks.whole,
+    "width": checks.whole,
+    "frame_rate": checks.frame_rate,
+    "shutter": checks.shutter,
+    "psnr": checks.psnr,
+    "bands": checks.bands,
+    "camera_path": checks.text,
+    "reuse": checks.flag,
+}
 SCENES: Table = {
     "family": checks.text,
-    "seeds, if any": checks.list_of(checks.seed), "count, if any": checks.whole, "first, if any": checks.seed,
-    "speed, if any": checks.list_of(checks.speed), "split, if any": checks.split,
+    "seeds, if any": checks.list_of(checks.seed),
+    "count, if any": checks.whole,
+    "first, if any": checks.seed,
+    "speed, if any": checks.list_of(checks.speed),
+    "split, if any": checks.split,
     **{f"{key}, if any": check for key, check in SETTINGS.items()},
-}  # fmt: skip
+}
 
 
 def jobs_of(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[Sensing, ...]) -> list[Job]:
@@ -111,7 +120,8 @@ def _seeds(section: Section, given: dict[str, Any]) -> list[int]:
         if other := next((key for key in ("count", "first") if key in given), None):
             raise ValueError(f"{section.where(other)}: give either seeds or count, not both")
         return list(given["seeds"])
-    first, count = given.get("first", 0), given.get("count", 1)
+    first = given.get("first", 0)
+    count = given.get("count", 1)
     if first + count > 2**31:
         key = "count" if "count" in given else "first"
         raise ValueError(f"{section.where(key)}: seeds {first} to {first + count - 1}; the largest is 2^31 - 1")

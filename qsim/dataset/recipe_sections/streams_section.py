@@ -11,22 +11,31 @@ from qsim.dataset.recipe_sections.toml_section import Section, file_name
 from qsim.structure import Table
 
 STREAMS: Table = {
-    "sensor": checks.text, "bits, if any": checks.list_of(checks.bits),
-    "ppp, if any": checks.list_of(checks.light), "lux, if any": checks.list_of(checks.light),
-    "absolute, if any": checks.flag, "follow, if any": checks.flag,
-    "seed, if any": checks.seed, "name, if any": file_name,
-    "group, if any": checks.flag, "slices, if any": checks.whole, "diffraction, if any": checks.flag,
-    "row_delay, if any": checks.positive, "row_order, if any": checks.row_order,
-    "colour, if any": checks.text, "exposures, if any": checks.shares,
+    "sensor": checks.text,
+    "bits, if any": checks.list_of(checks.bits),
+    "ppp, if any": checks.list_of(checks.light),
+    "lux, if any": checks.list_of(checks.light),
+    "absolute, if any": checks.flag,
+    "follow, if any": checks.flag,
+    "seed, if any": checks.seed,
+    "name, if any": file_name,
+    "group, if any": checks.flag,
+    "slices, if any": checks.whole,
+    "diffraction, if any": checks.flag,
+    "row_delay, if any": checks.positive,
+    "row_order, if any": checks.row_order,
+    "colour, if any": checks.text,
+    "exposures, if any": checks.shares,
     "temperature, if any": checks.real,
-}  # fmt: skip
+}
 
 
 def streams_of(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     """Return one stream per bits and light level, and add their names to `taken`; `ValueError` for a taken name."""
     given = section.values(STREAMS)
     levels = _light(section, given)
-    bits, name = given.get("bits", [None]), given.get("name")
+    bits = given.get("bits", [None])
+    name = given.get("name")
     sensor = _sensor(
         section, given["sensor"], bits, given.get("group", False), given.get("slices", 1), given.get("temperature")
     )

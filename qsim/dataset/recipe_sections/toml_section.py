@@ -38,7 +38,9 @@ class Text:
 
     def where(self, section: str | None, i: int, key: str | None = None) -> str:
         """Return `FILE:LINE` of a key in the i-th section of that name, or of the section's head without a key."""
-        number, inside, seen = 0, section is None, -1
+        number = 0
+        inside = section is None
+        seen = -1
         for n, line in enumerate(self.lines, 1):
             head = re.match(r"\s*\[\[?\s*([\w.-]+)\s*\]\]?", line)
             if head:

@@ -114,7 +114,8 @@ class Carrier:
         self.stage.place(self.time(t))
         layers = _Layers(self, t, self._kept[t], float(np.mean(own, where=np.isfinite(own))))
         layers.add(self._kept[t])
-        found, done = [own], 0
+        found = [own]
+        done = 0
         for reach in (*(k for k in REACH if k < self.neighbours), self.neighbours):
             for s in wanted:
                 if done < abs(s - t) <= reach:
@@ -126,7 +127,8 @@ class Carrier:
     def _traced(self, s: int) -> Traced:
         import drjit as dr
 
-        now, scene = self.time(s), self.stage.scene
+        now = self.time(s)
+        scene = self.stage.scene
         self.stage.place(now)
         view = scene.camera.pose(now)
         count = len(scene.bodies) + len(scene.lights) + len(scene.parts)
@@ -207,14 +209,17 @@ class _Layers:
         """
         import drjit as dr
 
-        mi, film = self.mi, self.carrier.film
+        mi = self.mi
+        film = self.carrier.film
         f, middle, level = (dr.opaque(mi.Float, n) for n in (film.camera.focal_pixels, *film.camera.axis))
         y, x, height, width = (dr.opaque(mi.Float, n) for n in film.crop)
         _, place = film.positions(part.seed, part.each, part.pixels, 2)
-        across, down = (place.x - middle) / f, (place.y - level) / f
+        across = (place.x - middle) / f
+        down = (place.y - level) / f
         row = [dr.gather(mi.Float, moves, part.body * 12 + i) for i in range(12)]
         x1, y1, z1 = (row[i] * across + row[i + 1] * down + row[i + 2] + row[i + 3] * part.inverse for i in (0, 4, 8))
-        column, line = dr.floor(x1 / z1 * f + middle) - x, dr.floor(y1 / z1 * f + level) - y
+        column = dr.floor(x1 / z1 * f + middle) - x
+        line = dr.floor(y1 / z1 * f + level) - y
         seen = (z1 > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
         return dr.select(seen, mi.UInt32(line) * mi.UInt32(width) + mi.UInt32(column), 0), part.inverse / z1, seen
 
@@ -229,7 +234,9 @@ class _Layers:
         """Return the share of the first layer in each pixel, float64 [H, W]."""
         import drjit as dr
 
-        film, mi, view = self.carrier.film, self.mi, self.target.view
+        film = self.carrier.film
+        mi = self.mi
+        view = self.target.view
         share = np.empty(self.pixels)
         parts = film.parts(COVERAGE)
         seeds = words(self.carrier.key(self.t), (1, len(parts)), redraw=2)[0].tolist()

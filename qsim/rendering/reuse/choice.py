@@ -91,7 +91,8 @@ def reused_mean(
         return _mixed(own, best, best, np.zeros(own.shape[1:]))
     cleaned = np.stack([denoised(half, *surfaces, quality) for half in best])
     z = own[0] - own[1]
-    apart, change = (cleaned - best).mean(axis=0), (cleaned[0] - cleaned[1]) - (best[0] - best[1])
+    apart = (cleaned - best).mean(axis=0)
+    change = (cleaned[0] - cleaned[1]) - (best[0] - best[1])
     gain = -(apart * (best - own).mean(axis=0) + change * z / 4)
     shares = _around(_sums(gain, TILE)) / np.maximum(_around(_sums(apart**2, TILE)), 1e-300)
     share = _spread(np.clip(shares, 0, 1), own.shape[1:])
@@ -100,7 +101,8 @@ def reused_mean(
 
 def _mixed(own: Array, best: Array, cleaned: Array, share: Array) -> SharedMixture:
     mixed = share * cleaned + (1 - share) * best
-    z, middle = own[0] - own[1], mixed.mean(axis=0)
+    z = own[0] - own[1]
+    middle = mixed.mean(axis=0)
     squares = (middle - own.mean(axis=0)) ** 2 + (mixed[0] - mixed[1]) * z / 2 - z**2 / 4
     noise = (mixed[0] - mixed[1]) ** 2 / 4
     return SharedMixture(share, middle, mixed.min(axis=0), squares, z**2 / 4, noise, apart=mixed - own)

@@ -34,7 +34,8 @@ SAMPLE_BYTES = 12  # that a kept sample takes: depth, body, radiance
 MOST_BYTES = 1.2e9  # that the kept samples of all neighbours may take
 MOST_TRIED = 2  # of COUNTS: a trial renders eleven frames
 MOST_TRIAL = 0.05  # of the predicted cost of a clip: what a trial may cost that nobody asked for
-NAME, ALONE = "reuse over time", "off, each frame alone"
+NAME = "reuse over time"
+ALONE = "off, each frame alone"
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,8 @@ def shared_samples(
     """
     if wanted is False:
         return need.alone, Finding(NAME, ALONE, "not requested")
-    renderer, alone = pilot.renderer, need.alone
+    renderer = pilot.renderer
+    alone = need.alone
     reason = unshared(renderer.scene, renderer.shutter, renderer.engine.backend) or "one frame" * (need.frames == 1)
     if reason:
         return alone, Finding(NAME, ALONE, f"not with {reason}")
@@ -128,7 +130,9 @@ class Trial:
     @classmethod
     def of(cls, pilot: Pilot, need: Need, samples: int, kinds: list[str]) -> Trial:
         """Return the trial of the pilot's middle frame."""
-        renderer, t, white = pilot.renderer, pilot.middle, need.allowed.white
+        renderer = pilot.renderer
+        t = pilot.middle
+        white = need.allowed.white
         camera = renderer.scene.camera
         pixels = camera.height * camera.width
         most = most_neighbours(samples, pixels)

@@ -37,7 +37,11 @@ from qsim.structure import COUNT, Table, expected, is_count, is_number, list_of,
 
 GLTF_SUFFIXES = (".glb", ".gltf")
 ROUNDING = 0.01  # by which the weights of a file may differ from a sum of 1: four bytes round by less
-POINTS, TRIANGLES, STRIP, FAN = 0, 4, 5, 6  # modes; those from points to before triangles are points and lines
+# modes; those from points to before triangles are points and lines
+POINTS = 0
+TRIANGLES = 4
+STRIP = 5
+FAN = 6
 MOST_VERTICES = 5_000_000  # of all pieces of a file
 
 ATTRIBUTES = expected("a table of accessors", mapping_of(r"\w+", is_count))
@@ -110,7 +114,8 @@ def still_pieces(path: str | Path) -> list[Piece]:
     pieces, joints = _read(document, nodes_of(document), {})
     raw = _unscaled(pieces, joints)
     _check_reach(document, raw)
-    vertices, mirrored = raw.deform(0.0), np.linalg.det(raw.matrices(0.0)[:, :3, :3]) < 0
+    vertices = raw.deform(0.0)
+    mirrored = np.linalg.det(raw.matrices(0.0)[:, :3, :3]) < 0
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
     return [
         Piece(
@@ -202,7 +207,8 @@ def _pieces(
         vertices = document.array(attributes["POSITION"], where, "VEC3").astype(np.float64)
         count = len(vertices)
         if bones is None:
-            owners, shares = np.full((count, 1), joint_of[number]), np.ones((count, 1))
+            owners = np.full((count, 1), joint_of[number])
+            shares = np.ones((count, 1))
         else:
             owners, shares = _influences(document, attributes, where, count, len(bones))
             owners = bones[owners]
@@ -232,7 +238,8 @@ def _bones(document: Document, skin: int, by: str, joints: list[Joint], joint_of
     binds = np.tile(np.eye(4).ravel(), (len(about["joints"]), 1))
     if "inverseBindMatrices" in about:
         binds = document.array(about["inverseBindMatrices"], f"skins[{skin}]", "MAT4", len(binds))
-    first, where = len(joints), f"{document.path}: skins[{skin}]"
+    first = len(joints)
+    where = f"{document.path}: skins[{skin}]"
     joints += [Joint(fixed(where, bind), joint_of[node]) for node, bind in zip(about["joints"], binds, strict=True)]
     return np.arange(first, len(joints))
 
@@ -298,10 +305,12 @@ def _joined(
     if size is not None and not 0 < size < np.inf:
         raise ValueError(f"animated_file: size must be a length above 0 [m], got {size!r}")
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
-    raw, moment = _unscaled(pieces, joints), clock.at(0.0)
+    raw = _unscaled(pieces, joints)
+    moment = clock.at(0.0)
     reach = _check_reach(document, raw)
     first = raw.deform(moment)
-    low, high = first.min(0), first.max(0)
+    low = first.min(0)
+    high = first.max(0)
     longest = float((high - low).max())
     if not longest > 0:
         raise ValueError(f"{document.path}: all its vertices lie in one point")

@@ -24,7 +24,8 @@ from qsim.parsing import parse_json
 from qsim.scene.files_beside import file_beside, regular_bytes
 from qsim.structure import COUNT, FLAG, TEXT, WHOLE, Table, expected, structure
 
-JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+JSON_CHUNK = 0x4E4F534A
+BINARY_CHUNK = 0x004E4942
 TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # What a file may require: these change materials or the type of numbers, which are read in any type.
@@ -76,7 +77,8 @@ class Document:
                 f"{self.path}: {by} needs {'' if count is None else f'{count} of '}{shape}, "
                 f"but {where} has {about['count']} of {about['type']}"
             )
-        kind, numbers = np.dtype(TYPES[about["componentType"]]), NUMBERS[shape]
+        kind = np.dtype(TYPES[about["componentType"]])
+        numbers = NUMBERS[shape]
         if "bufferView" in about:
             start = about.get("byteOffset", 0)
             values = self._elements(about["bufferView"], start, about["count"], numbers, kind, where)
@@ -99,14 +101,16 @@ class Document:
         about = self.entry("bufferViews", number, VIEW, by)
         if about["buffer"] >= len(self.buffers):
             raise ValueError(f"{self.path}: bufferViews[{number}] names buffers[{about['buffer']}], which is missing")
-        data, start = self.buffers[about["buffer"]], about.get("byteOffset", 0)
+        data = self.buffers[about["buffer"]]
+        start = about.get("byteOffset", 0)
         if start + about["byteLength"] > len(data):
             raise ValueError(f"{self.path}: bufferViews[{number}] reaches beyond the {len(data)} bytes of its buffer")
         return data[start : start + about["byteLength"]]
 
     def _patched(self, values: np.ndarray, sparse: Mapping[str, Any], where: str) -> np.ndarray:
         """Return the values with some replaced, of a sparse accessor."""
-        count, indices = sparse["count"], sparse["indices"]
+        count = sparse["count"]
+        indices = sparse["indices"]
         if count > len(values) or TYPES[indices["componentType"]][1] != "u":
             raise ValueError(f"{self.path}: {where}: sparse needs unsigned indices, at most as many as values")
         places = self._elements(
@@ -129,7 +133,8 @@ class Document:
         about = self.entry("bufferViews", view, VIEW, where)
         if about["buffer"] >= len(self.buffers):
             raise ValueError(f"{self.path}: bufferViews[{view}] names buffers[{about['buffer']}], which does not exist")
-        data, start = self.buffers[about["buffer"]], about.get("byteOffset", 0)
+        data = self.buffers[about["buffer"]]
+        start = about.get("byteOffset", 0)
         size = numbers * kind.itemsize
         stride = about.get("byteStride", size)
         end = offset + stride * (count - 1) + size
@@ -209,7 +214,8 @@ def _chunks(path: Path, raw: bytes) -> tuple[bytes, bytes | None]:
         raise ValueError(f"{path}: glTF container of version {version}; version 2 is read")
     if length > len(raw):
         raise ValueError(f"{path}: truncated: {len(raw)} bytes of {length}")
-    chunks, at = [], 12
+    chunks = []
+    at = 12
     while at + 8 <= length:
         size, kind = struct.unpack_from("<II", raw, at)
         if at + 8 + size > length:

@@ -22,7 +22,8 @@ from qsim.structure import COUNT, NUMBER, OBJECT, TEXT, Table, expected, is_numb
 
 WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = (9728, 9984, 9986)  # filters that take one texel: NEAREST, and with mipmaps
-WEBP, BASIS = "EXT_texture_webp", "KHR_texture_basisu"
+WEBP = "EXT_texture_webp"
+BASIS = "KHR_texture_basisu"
 
 PAIR = expected("two numbers", list_of(is_number, 2))
 FACTOR = expected("four numbers from 0 to 1", lambda v: list_of(is_number, 4)(v) and all(0 <= n <= 1 for n in v))
@@ -71,7 +72,8 @@ class Paints:
         found = self._document.array(attributes[name], by, "VEC2", count).astype(np.float64)
         if transform:
             turn = transform.get("rotation", 0.0)
-            cos, sin = np.cos(turn), np.sin(turn)
+            cos = np.cos(turn)
+            sin = np.sin(turn)
             scaled = found * transform.get("scale", (1.0, 1.0))
             # Counter-clockwise as coordinates are drawn, with v down (github.com/KhronosGroup/glTF/issues/1563)
             found = scaled @ np.array([[cos, -sin], [sin, cos]]) + transform.get("offset", (0.0, 0.0))
@@ -95,11 +97,13 @@ class Paints:
         about = document.entry("materials", number, MATERIAL, by)
         where = f"{document.path}: materials[{number}]"
         base = about.get("pbrMetallicRoughness") or {}
-        factor, info = base.get("baseColorFactor"), base.get("baseColorTexture")
+        factor = base.get("baseColorFactor")
+        info = base.get("baseColorTexture")
         older = (about.get("extensions") or {}).get("KHR_materials_pbrSpecularGlossiness")
         if older is not None and "pbrMetallicRoughness" not in about:
             base = structure(older, GLOSSINESS, where, closed=False)
-            factor, info = base.get("diffuseFactor"), base.get("diffuseTexture")
+            factor = base.get("diffuseFactor")
+            info = base.get("diffuseTexture")
         red, green, blue = (factor or (1.0, 1.0, 1.0))[:3]
         if info is None:
             return Paint(where, (red, green, blue)), None

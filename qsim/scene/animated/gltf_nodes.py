@@ -96,7 +96,8 @@ def tracks_of(document: Document, animation: int, nodes: list[dict[str, Any]], t
     for i, channel in enumerate(lists["channels"]):
         place = f"{document.path}: {where}.channels[{i}]"
         about = structure(channel, CHANNEL, place, closed=False)
-        node, path = about["target"].get("node"), about["target"]["path"]
+        node = about["target"].get("node")
+        path = about["target"]["path"]
         if node is None or path not in (*PATHS, "weights"):
             continue  # an extension animates something else: a light, a material
         if node >= len(nodes) or about["sampler"] >= len(lists["samplers"]):
@@ -157,7 +158,8 @@ def joints_of(
     document: Document, nodes: list[dict[str, Any]], tracks: Tracks, order: list[int], parents: Mapping[int, int]
 ) -> tuple[list[Joint], dict[int, int]]:
     """Return a joint for every node, behind one for the place of the body, and the joint of each node."""
-    joints, number = [Joint(Fixed(np.eye(4)))], {}
+    joints = [Joint(Fixed(np.eye(4)))]
+    number = {}
     for i in order:
         number[i] = len(joints)
         parent = number[parents[i]] if i in parents else 0

@@ -71,7 +71,8 @@ class Skinned(Motion):
                 raise ValueError(f"Skinned.joints[{i}]: its parent must come before it, got {joint.parent}")
         shares = check_shares("Skinned", self.owners, self.shares, len(rest), len(self.joints), ROUNDING)
         for morph in self.morphs:
-            count, targets = np.shape(morph.displacements)[1], np.shape(morph.displacements)[0]
+            count = np.shape(morph.displacements)[1]
+            targets = np.shape(morph.displacements)[0]
             if not 0 <= morph.first <= len(rest) - count or targets != morph.weights.values.shape[1]:
                 raise ValueError(
                     f"Skinned.morphs: displacements [M, v, 3] of existing vertices with M weights are needed, "
@@ -102,7 +103,8 @@ class Skinned(Motion):
         """
         moment = self.clock.at(t)
         with np.errstate(over="ignore", invalid="ignore"):  # refused below
-            matrices, shape = self.matrices(moment), self._morphed(moment)
+            matrices = self.matrices(moment)
+            shape = self._morphed(moment)
             moved = np.zeros_like(shape)
             for owners, shares in zip(self.owners.T, self.shares.T, strict=True):
                 chosen = matrices[owners]
@@ -123,7 +125,8 @@ class Skinned(Motion):
 
 def check_shares(where: str, owners: Array, shares: Array, vertices: int, joints: int, tolerance: float) -> Array:
     """Return the shares [V, n], float64, scaled to sum to 1; `ValueError` names the first wrong vertex."""
-    owners, shares = np.asarray(owners), np.asarray(shares, np.float64)
+    owners = np.asarray(owners)
+    shares = np.asarray(shares, np.float64)
     if owners.ndim != 2 or owners.shape != shares.shape or len(owners) != vertices:
         raise ValueError(
             f"{where}: joints and weights of shape [{vertices}, n] are needed, one row per vertex, "

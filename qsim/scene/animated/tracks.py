@@ -64,7 +64,8 @@ class Track:
     tangents: Array | None = None  # per second, [2, K, N]: before and after each key; for "cubic"
 
     def __post_init__(self) -> None:
-        times, values = np.asarray(self.times, np.float64), np.asarray(self.values, np.float64)
+        times = np.asarray(self.times, np.float64)
+        values = np.asarray(self.values, np.float64)
         if times.ndim != 1 or values.ndim != 2 or not len(times) or len(values) != len(times):
             raise ValueError(
                 f"Track: times [K] and values [K, N] of one or more keys are needed, got {times.shape}, {values.shape}"
@@ -99,11 +100,14 @@ class Track:
         if self.tangents is None:
             return (1 - s) * self.values[i] + s * self.values[i + 1]
         length = self.times[i + 1] - self.times[i]
-        leave, arrive = self.tangents[1, i] * length, self.tangents[0, i + 1] * length
+        leave = self.tangents[1, i] * length
+        arrive = self.tangents[0, i + 1] * length
         return (
-            (2 * s**3 - 3 * s**2 + 1) * self.values[i] + (s**3 - 2 * s**2 + s) * leave
-            + (3 * s**2 - 2 * s**3) * self.values[i + 1] + (s**3 - s**2) * arrive
-        )  # fmt: skip
+            (2 * s**3 - 3 * s**2 + 1) * self.values[i]
+            + (s**3 - 2 * s**2 + s) * leave
+            + (3 * s**2 - 2 * s**3) * self.values[i + 1]
+            + (s**3 - s**2) * arrive
+        )
 
     def quaternion_at(self, t: float) -> Array:
         """Return a track of quaternions (x, y, z, w) at time t [s], float64 [4], of length 1.
@@ -113,7 +117,8 @@ class Track:
         i, s = self._locate(t)
         if s == 0 or self.kind != "linear":
             return _unit(self.at(t))
-        start, end = _unit(self.values[i]), _unit(self.values[i + 1])
+        start = _unit(self.values[i])
+        end = _unit(self.values[i + 1])
         end = end if start @ end >= 0 else -end
         angle = 2 * np.arctan2(np.linalg.norm(end - start), np.linalg.norm(end + start))  # at most pi / 2
         shares = [x * np.sinc(x * angle / np.pi) / np.sinc(angle / np.pi) for x in (1 - s, s)]

@@ -14,8 +14,11 @@ import numpy as np
 from numpy import ndarray as Array
 
 _NEGLIGIBLE = 1e-10  # share of a fall that is left out at either end
-_LOW, _HIGH = 2.0**-17, 2.0**30  # sqrt(lambda) between which a fall is searched: 6e-11 to 1e18 arrivals
-_CELLS, _MOST_CELLS = 128, 2048
+# sqrt(lambda) between which a fall is searched: 6e-11 to 1e18 arrivals
+_LOW = 2.0**-17
+_HIGH = 2.0**30
+_CELLS = 128
+_MOST_CELLS = 2048
 _ERROR = 5e-7  # of a curve, at most
 _ROUNDING = 6e-7  # of coefficients, cubic and uniform number in float32, several times
 _PHOTONS = 1.2e-7  # relative, of light rounded to float32, twice
@@ -48,7 +51,8 @@ def falling(cdf: Steps, slope: Steps, count: int) -> Curves | None:
 
     None if no grid is fine enough.
     """
-    dark, bright = cdf(np.zeros((count, 1))), cdf(np.full((count, 1), _HIGH**2))
+    dark = cdf(np.zeros((count, 1)))
+    bright = cdf(np.full((count, 1), _HIGH**2))
     start = _last(lambda x: dark - cdf(x * x) < _NEGLIGIBLE, count)
     start[start <= _LOW] = 0.0
     stop = np.maximum(_last(lambda x: cdf(x * x) - bright >= _NEGLIGIBLE, count) * 1.001, start + 1e-3)
@@ -82,15 +86,20 @@ def _fitted(cdf: Steps, slope: Steps, start: Array, stop: Array, brightest: floa
 
 def _last(holds: Callable[[Array], Array], count: int) -> Array:
     """Return the largest x at which a condition holds that holds for small x alone: [count, 1], to 1e-4 of x."""
-    low, high = np.full((count, 1), np.log2(_LOW)), np.full((count, 1), np.log2(_HIGH))
+    low = np.full((count, 1), np.log2(_LOW))
+    high = np.full((count, 1), np.log2(_HIGH))
     for _ in range(18):
         middle = (low + high) / 2
         good = holds(2.0**middle)
-        low, high = np.where(good, middle, low), np.where(good, high, middle)
+        low = np.where(good, middle, low)
+        high = np.where(good, high, middle)
     return 2.0**low
 
 
 def _hermite(value: Array, slope: Array) -> Array:
     """Return the cubics' coefficients between neighbours: values and slopes per cell [K, n + 1] -> [K, n, 4]."""
-    v0, v1, d0, d1 = value[:, :-1], value[:, 1:], slope[:, :-1], slope[:, 1:]
+    v0 = value[:, :-1]
+    v1 = value[:, 1:]
+    d0 = slope[:, :-1]
+    d1 = slope[:, 1:]
     return np.stack([v0, d0, 3 * (v1 - v0) - 2 * d0 - d1, 2 * (v0 - v1) + d0 + d1], axis=-1)

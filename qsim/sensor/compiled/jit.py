@@ -104,11 +104,16 @@ def philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
     import drjit as dr
 
     u32 = type(x)
-    c0, c1, c2, c3 = x, y, frame, u32(0)
+    c0 = x
+    c1 = y
+    c2 = frame
+    c3 = u32(0)
     for _ in range(ROUNDS):
-        a, b = u32(MULTIPLIERS[0]), u32(MULTIPLIERS[1])
+        a = u32(MULTIPLIERS[0])
+        b = u32(MULTIPLIERS[1])
         c0, c1, c2, c3 = dr.mul_hi(b, c2) ^ c1 ^ high, b * c2, dr.mul_hi(a, c0) ^ c3 ^ low, a * c0
-        high, low = high + KEY_STEPS[0], low + KEY_STEPS[1]
+        high = high + KEY_STEPS[0]
+        low = low + KEY_STEPS[1]
     return [c0, c1, c2, c3]
 
 
@@ -120,7 +125,8 @@ def exp_below_zero(x: Any) -> Any:
     """
     import drjit as dr
 
-    real, bits = backend().Float, backend().UInt32
+    real = backend().Float
+    bits = backend().UInt32
     magic = real(1.5 * 2.0**23)
     shifted = dr.fma(x, real(1 / log(2)), magic)
     n = shifted - magic

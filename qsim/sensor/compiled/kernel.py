@@ -127,7 +127,9 @@ def _traced(
         pair: Any, frame: Any, row: Any, arguments: list[Any], indices: list[Any], block: Any, high: Any, low: Any
     ) -> tuple[Any, Any]:
         index, below_y, below_t, mask_x, mask_y = indices
-        t, y, x = index >> below_t, (index & mask_y) >> below_y, index & mask_x
+        t = index >> below_t
+        y = (index & mask_y) >> below_y
+        x = index & mask_x
         first_plane = (frame + t) * planes
         photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
 
@@ -154,7 +156,8 @@ def _count(
     """Return the codes of the pixels of a thread, and whether one of them is uncertain."""
     import drjit as dr
 
-    jit, real = backend(), backend().Float
+    jit = backend()
+    real = backend().Float
     sums = _sums(plan)
     efficiency, dark, margin, *scalars = scalars
     uncertain = no_light(photons)
@@ -191,7 +194,8 @@ def _search(steps: list[Any], u: Any) -> tuple[Any, Any]:
     import drjit as dr
 
     count = backend().UInt32
-    code, near = count(0), type(u)(dr.inf)
+    code = count(0)
+    near = type(u)(dr.inf)
     while steps:
         half = len(steps) // 2
         distance = u - steps[half]
@@ -218,13 +222,17 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
         return result + [real(2)] * (steps.levels - 1 - len(result)), real(1)  # no live time: never passed
     n = len(steps.full)
     highest, scale = scalars[:2]
-    full, bands = scalars[2 : 2 + n], iter(scalars[2 + n :])
+    full = scalars[2 : 2 + n]
+    bands = iter(scalars[2 + n :])
     mean = smaller(mean, highest)
-    unit, grow = dr.exp(mean * 0.5 if steps.halved else mean), mean * scale
+    unit = dr.exp(mean * 0.5 if steps.halved else mean)
+    grow = mean * scale
     terms = [1 / unit if steps.halved else real(1)]
     for _ in range(1, n):
         terms.append(terms[-1] * grow)
-    result, total, summed = [], real(0), 0
+    result = []
+    total = real(0)
+    summed = 0
     for prefix, band, floor in zip(steps.prefix, steps.band, steps.floor, strict=True):
         for m in range(summed, prefix):
             total = dr.fma(terms[m], full[m], total)
@@ -238,7 +246,8 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
 
 def _numbers(plan: Plan) -> list[float]:
     """Return the numbers of a plan, in the order in which `_count` and `_steps` take them."""
-    values, steps = [plan.efficiency, plan.dark, plan.margin], _sums(plan)
+    values = [plan.efficiency, plan.dark, plan.margin]
+    steps = _sums(plan)
     if isinstance(steps, Live):
         return [*values, *steps.shares]
     values += [steps.highest, 1 / steps.scale, *steps.full]

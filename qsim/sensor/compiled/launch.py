@@ -38,7 +38,8 @@ def sample(plan: Plan, photons: Array, key: Key, origin: tuple[int, int], exact:
 
     `origin` (y, x) places a crop in the full frame; `exact` draws the pixels that the kernel leaves uncertain.
     """
-    left, width = origin[1] & 3, photons.shape[2]
+    left = origin[1] & 3
+    width = photons.shape[2]
     codes = np.empty(photons.shape, np.uint8)
     uncertain = []
     for frames, rows, pairs, at in _parts(plan, photons, key, origin, blocks=1):
@@ -90,7 +91,8 @@ def _octets(pairs: Array, bits: int) -> Array:
 
 def _join(numbers: Array, bits: int) -> Array:
     """Return neighbours side by side: [..., 2 n] numbers of `bits` bits -> [..., n] of twice as many, first highest."""
-    width, wide = 8 * numbers.itemsize, np.dtype(f"u{2 * numbers.itemsize}") if numbers.itemsize < 8 else None
+    width = 8 * numbers.itemsize
+    wide = np.dtype(f"u{2 * numbers.itemsize}") if numbers.itemsize < 8 else None
     if wide is None:
         return numbers[..., ::2] << np.uint64(bits) | numbers[..., 1::2]
     both = numbers.view(wide)  # little-endian: the first one is in the low half

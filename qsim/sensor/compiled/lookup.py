@@ -15,10 +15,14 @@ def count(steps: int, photons: list[Any], words: Callable[[Any], list[Any]], giv
 
     jit = backend()
     efficiency, dark, margin, brightest, *curves = given
-    uncertain, codes = no_light(photons), []
+    uncertain = no_light(photons)
+    codes = []
     for theta, word in zip(photons, words(jit.UInt32(0)), strict=True):
-        x, u = dr.sqrt(dr.fma(jit.Float64(theta), efficiency, dark)), uniform32(word)
-        code, near, half = jit.UInt32(0), jit.Float(1), (steps + 1) // 2
+        x = dr.sqrt(dr.fma(jit.Float64(theta), efficiency, dark))
+        u = uniform32(word)
+        code = jit.UInt32(0)
+        near = jit.Float(1)
+        half = (steps + 1) // 2
         while half:
             distance = u - curve(curves, code + (half - 1), x)
             near = smaller(near, dr.abs(distance))

@@ -36,7 +36,8 @@ def sample(
     import drjit as dr
 
     jit = backend()
-    light, codes = jit.Float(photons), dr.zeros(jit.UInt8, int(np.prod(shape)))
+    light = jit.Float(photons)
+    codes = dr.zeros(jit.UInt8, int(np.prod(shape)))
     fixed = fixed_scalars(key, origin)
     for frames, rows, threads in _parts(shape, origin):
         part = (frames.stop - frames.start, rows.stop - rows.start, threads)
@@ -81,8 +82,10 @@ def _places(
     jit = backend()
     _, rows, threads = part
     number = dr.arange(jit.UInt32, int(np.prod(part)))
-    frame, rest = number // (rows * threads), number % (rows * threads)
-    row, column = rest // threads, 2 * (rest % threads) + side
+    frame = number // (rows * threads)
+    rest = number % (rows * threads)
+    row = rest // threads
+    column = 2 * (rest % threads) + side
     left = origin[1] & 3
     inside = (column >= left) & (column < left + shape[2])
     return ((frame + t) * shape[1] + row + y) * shape[2] + column - left, inside

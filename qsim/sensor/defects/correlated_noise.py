@@ -15,7 +15,9 @@ from numpy import ndarray as Array
 
 from qsim.keys import Key, uniform, words
 
-_AFTERPULSE, _CROSSTALK = 101, 102  # stages of a clip's key; crosstalk takes one per direction
+# stages of a clip's key; crosstalk takes one per direction
+_AFTERPULSE = 101
+_CROSSTALK = 102
 _PER_STAGE = 1 << 20  # from the stages of one use of a clip to those of the next
 _DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))  # from a pixel to the neighbour that it disturbs
 
@@ -87,9 +89,11 @@ def _crosstalk(
     height, width = codes.shape
     for number, (dy, dx) in enumerate(_DIRECTIONS):
         u = uniform(words(_step(key, _CROSSTALK + number), codes.shape, origin))
-        sent, j = np.zeros(codes.shape, np.int64), 0
+        sent = np.zeros(codes.shape, np.int64)
+        j = 0
         while (more := (j < codes) & (u >= bdtr(j, np.maximum(codes, 1), probability))).any():
-            sent, j = sent + more, j + 1
+            sent = sent + more
+            j = j + 1
         target = (slice(max(dy, 0), height + min(dy, 0)), slice(max(dx, 0), width + min(dx, 0)))
         source = (slice(max(-dy, 0), height + min(-dy, 0)), slice(max(-dx, 0), width + min(-dx, 0)))
         total[target] += sent[source]

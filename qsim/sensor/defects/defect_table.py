@@ -39,8 +39,13 @@ from qsim import checks, files
 from qsim.sensor.defects.fixed_pattern import DarkSpread, FixedPattern
 from qsim.structure import Table, expected, structure, table_of
 
-_MAPS = {"gain_map": "prnu", "dark_map": "dark", "dead_map": "dead", "offset_map": "offset",
-         "read_noise_map": "read_noise"}  # fmt: skip
+_MAPS = {
+    "gain_map": "prnu",
+    "dark_map": "dark",
+    "dead_map": "dead",
+    "offset_map": "offset",
+    "read_noise_map": "read_noise",
+}
 _PATTERN = ("device_seed", "prnu", "dead", "offset", "read_noise")
 _DISTURBANCES = ("crosstalk", "afterpulse", "afterpulse_delay")
 _NOT_NEGATIVE = expected("a number of at least 0", lambda v: type(v) in (int, float) and 0 <= v < float("inf"))

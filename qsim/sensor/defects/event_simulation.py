@@ -34,7 +34,9 @@ from qsim.sensor.defects.pixel_array import PixelArray
 TOLERANCE = 1e-3  # relative change of the mean count that a closed form may miss
 _STRIP_BYTES = 1 << 25  # of light in memory while single pixels are followed through a clip
 
-DETECTED, RELEASED = 1, 2  # of an event: the pixel counted it; it was a trapped carrier, no arrival
+# of an event: the pixel counted it; it was a trapped carrier, no arrival
+DETECTED = 1
+RELEASED = 2
 Event = tuple[float, int]  # time [s] and the sum of these
 
 IncidentLight = Callable[[int, int, int], Array]  # (frame, first row, rows) -> photons [slices, rows, W]
@@ -160,7 +162,8 @@ def _carried(sensor: CountingSPAD, arrivals: Array, share: float, reach: float) 
     dim = arrivals * reach**2 / 2
     if not sensor.paralyzable:
         return dim
-    y, x = arrivals * min(reach, 1.0), arrivals * min(share, 1.0)
+    y = arrivals * min(reach, 1.0)
+    x = arrivals * min(share, 1.0)
     taken = -np.expm1(-y) - y * np.exp(-y)
     left = np.exp(-y) * (y - np.expm1(y - x)) + arrivals * max(1 - share, 0.0) * np.exp(-x)
     return np.maximum(dim, taken / np.maximum(left, np.finfo(float).tiny))
@@ -208,9 +211,11 @@ def expose(
     log: list[Event] | None = None,
 ) -> tuple[int, State]:
     """Return the count of one exposure and the state after it; arrivals [s] and released carriers in time order."""
-    waiting, carriers = [*arrivals, *(time for time in state.trapped if time >= start)], set(state.trapped)
+    waiting = [*arrivals, *(time for time in state.trapped if time >= start)]
+    carriers = set(state.trapped)
     heapify(waiting)
-    count, dead_until = 0, state.dead_until
+    count = 0
+    dead_until = state.dead_until
     while waiting and waiting[0] < start + exposure:
         time = heappop(waiting)
         live = time >= dead_until

@@ -47,7 +47,9 @@ class DarkSpread:
     @property
     def mean(self) -> float:
         """Mean rate over median rate: the factor from a data sheet's median to the sensor's rate."""
-        low, high, a = self.hot_from, self.hot_to, self.tail
+        low = self.hot_from
+        high = self.hot_to
+        a = self.tail
         norm = low**-a - high**-a
         hot = np.log(high / low) / norm if a == 1 else a / (1 - a) * (high ** (1 - a) - low ** (1 - a)) / norm
         return (1 - self.hot_share) * float(np.exp(self.spread**2 / 2)) + self.hot_share * float(hot)
@@ -56,7 +58,9 @@ class DarkSpread:
         """Return rates over the mean rate [...] from two uniform numbers [...] per pixel: kind and size."""
         from scipy.special import ndtri
 
-        low, high, a = self.hot_from, self.hot_to, self.tail
+        low = self.hot_from
+        high = self.hot_to
+        a = self.tail
         hot = (low**-a - v * (low**-a - high**-a)) ** (-1 / a)
         return np.where(u < self.hot_share, hot, np.exp(self.spread * ndtri(v))) / self.mean
 

@@ -71,7 +71,8 @@ def of_stream(sensor: Sensor, meta: Mapping[str, Any]) -> tuple[Sensor, str]:
 
     The text is empty without defects. The sensor stays as it is where the light is unknown or a map is missing.
     """
-    table, ppp = meta.get("defects") or {}, meta.get("ppp")
+    table = meta.get("defects") or {}
+    ppp = meta.get("ppp")
     left = [_WORDS.get(key, key) for key in table if key not in _NO_EFFECT]
     if not left:
         return sensor, ""

@@ -163,7 +163,8 @@ class PixelArray:
     ) -> tuple[Array, Array | None]:
         """Return codes as sums of M planes, as BinarySPAD draws them, each with afterpulses of the plane before."""
         assert isinstance(self.sensor, BinarySPAD)
-        m, plane = self.sensor.planes, replace(self, sensor=replace(self.sensor, bits=1))
+        m = self.sensor.planes
+        plane = replace(self, sensor=replace(self.sensor, bits=1))
         codes = np.zeros(photons.shape, self.sensor.dtype)
         for p in range(len(photons) * m):
             at = key.at(key.frame * m + p)

@@ -46,7 +46,8 @@ def speed_for(px: float, motion: Callable[[float], float], name: str) -> tuple[f
     Raise `ValueError` if the scene is still or if no factor comes within 5 %.
     """
     low, high = SPEEDS
-    speed, tried = 1.0, {}
+    speed = 1.0
+    tried = {}
     for _ in range(10):
         tried[speed] = motion(speed)
         if abs(tried[speed] / px - 1) < CLOSE:
@@ -144,7 +145,8 @@ def answer(found: Study) -> str:
 
 
 def _of_model(found: Study, model: str) -> str:
-    best, edge = found.best(model), at_edge(found, model)
+    best = found.best(model)
+    edge = at_edge(found, model)
     rows = sorted((row for row in found.rows if row.model == model), key=lambda row: row.bits)
     place = rows.index(best)
     beside = [row for row in (rows[place - 1] if place else None, *rows[place + 1 : place + 2]) if row is not None]

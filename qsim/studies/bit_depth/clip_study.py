@@ -117,7 +117,8 @@ def instants(frames: int, settings: StudySettings) -> tuple[int, ...]:
     """Return the centres of frames of the deepest depth, spread over the clip without overlap."""
     span = settings.longest
     count = min(settings.instants, frames // span)
-    first, last = span // 2, frames - 1 - span // 2
+    first = span // 2
+    last = frames - 1 - span // 2
     return tuple(int(t) for t in np.linspace(first, last, count).round()) if count > 1 else (frames // 2,)
 
 
@@ -141,7 +142,9 @@ def expose(
         for t, light in zip(places, pair, strict=True):
             p = plane.pmf(light, clip.exposure)
             fired += plane.sample(light, clip.exposure, key=key.at(t), origin=clip.origin)
-            total, quiet, spread = total + light, quiet + p[..., 0], spread + p[..., 0] * p[..., 1]
+            total = total + light
+            quiet = quiet + p[..., 0]
+            spread = spread + p[..., 0] * p[..., 1]
         if reach:
             structure[2 * reach - 1] += np.sum((pair[0] - before)[scored] ** 2)
             structure[2 * reach] += np.sum((pair[0] - pair[1])[scored] ** 2)
@@ -170,7 +173,8 @@ class _Sums:
         predicted = (mean / m - sharp) ** 2 + variance / m**2
         sensor = readout.sensor
         arrivals = sensor.efficiency * frame.photons + sensor.dark_rate * _duration(readout)
-        blur, shot = (frame.photons / m - sharp) ** 2, arrivals / (m * sensor.efficiency) ** 2
+        blur = (frame.photons / m - sharp) ** 2
+        shot = arrivals / (m * sensor.efficiency) ** 2
         noise = ((mean - frame.photons) ** 2 + variance) / m**2
         self.pixels += simulated.size
         for i, part in enumerate((simulated, predicted, (simulated - predicted) ** 2, blur, shot, noise)):

@@ -65,7 +65,8 @@ def render(name: str, path: Path, shape: ClipShape, *, speed: float = 1.0, progr
                 "with -o"
             )
         return clip
-    frames, rate = shape.frames, shape.frame_rate
+    frames = shape.frames
+    rate = shape.frame_rate
     chosen = fidelity.choose_budget(scene, frame_rate=rate, frames=frames, psnr=shape.psnr, seed=shape.seed)
     extra = {"reads": read} if read else None
     return render_clip(

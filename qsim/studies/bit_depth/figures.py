@@ -20,7 +20,8 @@ def study_figure(found: Study) -> bytes:
     left, right = drawing.subplots(1, 2)
     for model in MODELS:
         rows = [row for row in found.rows if row.model == model]
-        bits, colour = [row.bits for row in rows], COLOURS[model]
+        bits = [row.bits for row in rows]
+        colour = COLOURS[model]
         left.plot(bits, [row.psnr_predicted_db for row in rows], color=colour, label=f"{model}, expected")
         errors = [2 * row.psnr_error_db for row in rows]
         left.errorbar(bits, [row.psnr_db for row in rows], errors, fmt="o", color=colour, label=f"{model}, simulated")
@@ -56,12 +57,14 @@ def sweep_figure(found: Sweep) -> bytes:
     drawing = new_figure(11, 4.2)
     bits = sorted({row.bits for line in found.studies for one in line for row in one.rows})
     pixels = ", moving pixels" if found.studies[0][0].moving else ""
-    panels, colours = list(drawing.subplots(1, 2)), {"cmap": "viridis", "vmin": bits[0] - 0.5, "vmax": bits[-1] + 0.5}
+    panels = list(drawing.subplots(1, 2))
+    colours = {"cmap": "viridis", "vmin": bits[0] - 0.5, "vmax": bits[-1] + 0.5}
     for axes, model in zip(panels, MODELS, strict=True):
         table = np.array([[s.best(model).bits for s in row] for row in found.studies])
         drawn = axes.imshow(table, origin="lower", aspect="auto", **colours)
         for (i, j), best in np.ndenumerate(table):
-            shown, near = marked(found.studies[i][j], model), "white" if best <= np.mean(bits) else "black"
+            shown = marked(found.studies[i][j], model)
+            near = "white" if best <= np.mean(bits) else "black"
             if shown != str(best):
                 axes.add_patch(
                     Rectangle((j - 0.5, i - 0.5), 1, 1, fill=False, hatch="///", edgecolor="0.5", linewidth=0)

@@ -79,6 +79,7 @@ class Structure:
 
     def blur(self, planes: int, speed: float = 1.0) -> float:
         """Return the mean square error [photons^2] of a frame against its sharp middle, at `speed` times the motion."""
-        k, s = np.arange(1, planes), np.arange(planes) - planes // 2
+        k = np.arange(1, planes)
+        s = np.arange(planes) - planes // 2
         within = float(np.sum((planes - k) * self.at(speed * k))) / planes**2
         return max(float(np.mean(self.at(speed * np.abs(s)))) - within, 0.0)

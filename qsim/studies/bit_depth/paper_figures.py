@@ -48,7 +48,8 @@ def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
     longest = round(clip.frame_rate / min(fps for _, fps in CAMERAS))
     if len(clip) < longest:
         raise ValueError(f"{clip.path}: {len(clip)} frames; one frame at 60 fps needs {longest}; render a longer clip")
-    level, middle = light_level(clip, lux=lux), len(clip) // 2
+    level = light_level(clip, lux=lux)
+    middle = len(clip) // 2
     sharp = clip_photons(clip, middle, level.factor, sharp=True)
     peak = colour.peak(sharp)
     speed = clip_motion(clip, middle)
@@ -81,9 +82,11 @@ def figure_2(clip: Clip, ppp: float, *, seed: int = 0, bits: Sequence[int] = BIT
     """Return sums of 2^b - 1 binary planes around the middle of a clip; `ppp` counts detections per pixel and plane."""
     settings = StudySettings(bits=tuple(bits), sensor="spad-320x240", ppp=ppp, seed=seed)
     check_clip(clip, settings)
-    level, middle = light_level(clip, ppp=ppp), len(clip) // 2
+    level = light_level(clip, ppp=ppp)
+    middle = len(clip) // 2
     sharp = clip_photons(clip, middle, level.factor, sharp=True)
-    peak, speed = colour.peak(sharp), clip_motion(clip, middle)
+    peak = colour.peak(sharp)
+    speed = clip_motion(clip, middle)
     panels = [Panel("sharp instant", sharp, {"ppp": ppp, "peak": peak})]
     plane = BinarySPAD(1.0, 0.0)
     nothing = np.zeros(2 ** settings.bits[-1] - 1)

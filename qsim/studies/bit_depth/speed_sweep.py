@@ -115,8 +115,10 @@ def sweep(
         studies.append(tuple(row))
     speeds = tuple(one.speed for one in clips)
     slowest = int(np.argmin(speeds))
-    base, clip = studies[slowest][len(ppps) // 2], clips[slowest].clip
-    predicted, loss = {}, {}
+    base = studies[slowest][len(ppps) // 2]
+    clip = clips[slowest].clip
+    predicted = {}
+    loss = {}
     for model in MODELS:
         table = [
             [
@@ -184,8 +186,23 @@ def table(found: Study) -> list[str]:
         f"{found.speed}, {len(found.instants)} instants; errors are rms in photons per plane{pixels}, peak "
         f"{found.peak:.3g}",
     ]
-    header = ("model", "bits", "fps", "px/frame", "blur", "(law)", "shot", "levels", "read", "SNR dB", "PSNR dB",
-              "(expected)", "+-", "sigmas", "MB/s")  # fmt: skip
+    header = (
+        "model",
+        "bits",
+        "fps",
+        "px/frame",
+        "blur",
+        "(law)",
+        "shot",
+        "levels",
+        "read",
+        "SNR dB",
+        "PSNR dB",
+        "(expected)",
+        "+-",
+        "sigmas",
+        "MB/s",
+    )
     return lines + text_table(map(_cells, found.rows), header)
 
 

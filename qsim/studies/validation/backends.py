@@ -104,7 +104,9 @@ def _measure(backend: str, family: str, height: int, width: int, seed: int) -> B
     from qsim.rendering.renderer import Renderer
 
     renderer = Renderer(scenes.load(family, seed=seed).resized(height, width), budget=BUDGET)
-    seconds, outside, frames = [], [], []
+    seconds = []
+    outside = []
+    frames = []
     for t in range(FRAMES + 1):
         with kernels_timed() as inside:
             started = time.perf_counter()

@@ -25,7 +25,8 @@ def hard_cases(sensors: dict[str, Sensor], exposure: float) -> list[Case]:
     cases = []
     light = np.array([0.0, 1e-12, 1e-6, 1.0, 1e3, 1e6, 1e12])
     for name, sensor in sensors.items():
-        cdf, log_pmf = sensor.cdf(light, exposure), sensor.log_pmf(light, exposure)
+        cdf = sensor.cdf(light, exposure)
+        log_pmf = sensor.log_pmf(light, exposure)
         total = np.exp(log_pmf).sum(axis=-1)
         good = (
             bool(np.isfinite(cdf).all() and (np.diff(cdf, axis=-1) >= -1e-12).all())

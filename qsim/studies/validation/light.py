@@ -102,9 +102,11 @@ def _row(scene: Scene, level: float, references: Array, frames: Sequence[int], s
     ours = Renderer(scene, budget=chosen, seed=seed)
     drawn = [ours.frame(t, with_truth=False) for t in frames]
     truth = references.mean(axis=0)
-    white, light = white_in(truth), float(truth.mean())
+    white = white_in(truth)
+    light = float(truth.mean())
     images = np.stack([frame.radiance for frame in drawn])
-    found, own = Errors.between(images, truth, white), Errors.of_halves(references, white)
+    found = Errors.between(images, truth, white)
+    own = Errors.of_halves(references, white)
     noise = Errors.of_halves(np.stack([_halves(ours, t) for t in frames], axis=1), white).plain
     stated = [error_at(white, frame.errors_at) for frame in drawn], [frame.error for frame in drawn]
     error = math.hypot(noise, own.plain) / math.sqrt(images.size) / light
@@ -145,8 +147,20 @@ def table(report: LightReport) -> str:
     if wrong:
         verdict = f"NOT as wanted or announced: {', '.join(wrong)}"
     size = f"{report.height} x {report.width} pixels, engine {report.engine}; dB below white, light in %"
-    header = ("scene", "asked", "reached", "stated", "unclamped: reached", "stated", "samples", "bounces",
-              "light", "announced", "+-", "")  # fmt: skip
+    header = (
+        "scene",
+        "asked",
+        "reached",
+        "stated",
+        "unclamped: reached",
+        "stated",
+        "samples",
+        "bounces",
+        "light",
+        "announced",
+        "+-",
+        "",
+    )
     return "\n".join([size, *text_table(map(_cells, report.rows), header), verdict])
 
 

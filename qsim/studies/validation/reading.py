@@ -25,9 +25,14 @@ from qsim.clip.writer import ClipWriter
 from qsim.formats import exporting
 from qsim.tables import text_table
 
-FRAMES, HEIGHT, WIDTH = 65, 512, 1024
-WINDOW, CROP = 11, 128
-WANTED, RATIO = 100.0, 5.0  # wanted windows per second, and times the mp4
+FRAMES = 65
+HEIGHT = 512
+WIDTH = 1024
+WINDOW = 11
+CROP = 128
+# wanted windows per second, and times the mp4
+WANTED = 100.0
+RATIO = 5.0
 
 Place = tuple[int, int, int]  # first frame, y, x
 
@@ -84,7 +89,8 @@ def run(seconds: float = 4.0, seed: int = 0) -> ReadingReport:
         places = [_place(rng) for _ in range(8)]
         difference = np.mean([(sides[0](at) / 1.1 - sides[1](at) / 255.0) ** 2 for at in places])
         rates = [_rate(side, seconds / 2, seed + turn) for turn in range(2) for side in sides]
-    ours, theirs = max(rates[0::2]), max(rates[1::2])
+    ours = max(rates[0::2])
+    theirs = max(rates[1::2])
     return ReadingReport(ours[0], theirs[0], ours[1], theirs[1], float(np.sqrt(difference)))
 
 
@@ -137,7 +143,9 @@ def _rate(draw: Callable[[Place], Array], seconds: float, seed: int) -> tuple[fl
     """Return windows per second, and per processor second, over at least so many seconds; the first is not timed."""
     rng = np.random.default_rng(seed)
     draw(_place(rng))
-    done, started, worked = 0, time.perf_counter(), time.process_time()
+    done = 0
+    started = time.perf_counter()
+    worked = time.process_time()
     while True:
         draw(_place(rng))
         done += 1

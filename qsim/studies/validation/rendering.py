@@ -38,10 +38,14 @@ from qsim.scene import Scene
 from qsim.tables import text_table
 
 LEVELS = (30.0, 35.0, 40.0, 45.0)  # dB below white
-WANTED_RATIO, AT_LEVEL = 10.0, 40.0  # of the median scene
+# of the median scene
+WANTED_RATIO = 10.0
+AT_LEVEL = 40.0
 MOST_SAMPLES = 2**8  # of the naive loop that are timed; for more, the time is extrapolated and marked
 TUNED = ("fan", "tumble", "gears", "flag", "crowd", "drums", "text")  # used while the choice of budgets was written
-MOST_ROUNDS, ENOUGH = 15, 5.0  # rounds of timing a row; seconds after which the least number suffices
+# rounds of timing a row; seconds after which the least number suffices
+MOST_ROUNDS = 15
+ENOUGH = 5.0
 FRAME = 3  # the first frame that is rendered
 
 
@@ -178,10 +182,12 @@ class NaiveLoop:
 
     def frame(self, t: int, samples: int, redraw: int = 0) -> Array:
         """Return the radiance of the window at mid-exposure of frame t, float64 [H, W]; `redraw` selects samples."""
-        ours, now = self._renderer, self._renderer.time(t)
+        ours = self._renderer
+        now = self._renderer.time(t)
         activate(ours.engine)
         self._stage.place(now)
-        pose, seed = ours.scene.camera.pose(now), int(words(ours.key(t), (1, 1), redraw=redraw)[0, 0])
+        pose = ours.scene.camera.pose(now)
+        seed = int(words(ours.key(t), (1, 1), redraw=redraw)[0, 0])
         return film_pass(self._stage, pose, ours.crop, seed, samples, self._integrator, "independent")
 
     def mean(self, t: int, samples: int) -> Array:
@@ -199,7 +205,8 @@ def _compare(
     naive = NaiveLoop(ours)
     samples, naive_psnr = _naive_samples(naive, level, target)
     timed = min(samples, most_samples)
-    theirs, own = [], []
+    theirs = []
+    own = []
     end = time.perf_counter() + ENOUGH
     for i in range(max(rounds, MOST_ROUNDS) + 1):  # the first round compiles and does not count
         if i > rounds and time.perf_counter() > end:
@@ -296,7 +303,8 @@ def _cells(row: RenderRow) -> list[str]:
 def figure(report: RenderReport, path: Path) -> None:
     """Write seconds per frame against PSNR to `path` (.png, .svg or .pdf), one panel per scene."""
     names = list(dict.fromkeys(row.scene for row in report.rows))
-    across, down = min(4, len(names)), math.ceil(len(names) / 4)
+    across = min(4, len(names))
+    down = math.ceil(len(names) / 4)
     drawn = new_figure(3.2 * across, 3.4 * down)
     panels = np.ravel(drawn.subplots(down, across, sharex=True, sharey=True, squeeze=False))
     for axes in panels[len(names) :]:

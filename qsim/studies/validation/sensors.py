@@ -206,7 +206,8 @@ def statistics(codes: Array, sensor: Sensor, photons: float) -> tuple[float, flo
     from scipy.stats import chi2
 
     pmf = np.exp(sensor.log_pmf(np.array(photons), EXPOSURE))
-    counts, n = np.bincount(codes.ravel(), minlength=pmf.size).astype(float), codes.size
+    counts = np.bincount(codes.ravel(), minlength=pmf.size).astype(float)
+    n = codes.size
     frequent = pmf * n >= 5
     observed = np.append(counts[frequent], counts[~frequent].sum())
     expected = np.append(pmf[frequent], pmf[~frequent].sum()) * n
@@ -244,7 +245,8 @@ def _cdf_error(sensor: Sensor, engine: str) -> float | None:
         found = kernel.cdf_steps(plan, photons)
         if isinstance(sensor, BinarySPAD):  # the kernel compares plane by plane
             expected = np.exp(-sensor.arrivals(photons, EXPOSURE) / sensor.planes)[:, None]
-        found, expected = np.minimum(found, 1), np.minimum(expected, 1)
+        found = np.minimum(found, 1)
+        expected = np.minimum(expected, 1)
     return float(np.abs(found - expected).max())
 
 

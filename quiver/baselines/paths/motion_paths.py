@@ -116,7 +116,8 @@ def correct(
     information = float(scale**2)  # of a cell: 1 / variance of the noise
     k = torch.tensor([float(offset) for offset in offsets])
     q = k * k / 2
-    k, q = k - k.mean(), q - q.mean()
+    k = k - k.mean()
+    q = q - q.mean()
     fast = float(k @ k)
     if fast == 0:
         return velocity, acceleration
@@ -159,7 +160,8 @@ def _errors(
         ),
         strict=True,
     )
-    moved, inside = torch.stack(seen), torch.stack(votes)
+    moved = torch.stack(seen)
+    inside = torch.stack(votes)
     mean = (moved * inside).sum(0) / inside.sum(0)
     misfit = box_mean((moved - mean).square_(), 1) * (scale**2 / MISFIT)
     vote = inside / (1 + misfit.square_())

@@ -32,7 +32,10 @@ def smooth_mean(image: Tensor, radius: int) -> Tensor:
 
 def _sums(x: Tensor, count: int, dim: int) -> Tensor:
     """Return sums of `count` neighbours along one axis, by sums of 1, 2, 4, ... neighbours."""
-    length, place, width, rest = x.shape[dim] - count + 1, 0, 1, count
+    length = x.shape[dim] - count + 1
+    place = 0
+    width = 1
+    rest = count
     total: Tensor | None = None
     while True:
         if rest & 1:

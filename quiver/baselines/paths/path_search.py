@@ -45,7 +45,8 @@ def search(frames: Tensor, offsets: Sequence[int], scale: int, speed: float) -> 
     cost = _cost(misfits.flatten(0, 1), inside.flatten(0, 1), len(voters), (unit, 3 * unit))
     cost += (MOVES * (pace > 0) + FASTER * pace.log1p())[:, None, None]
     best = cost.argmin(0)
-    down, right = best // count, best % count
+    down = best // count
+    right = best % count
     found = [place - most + _between(cost, best, step, place, count) for place, step in ((down, count), (right, 1))]
     return torch.stack(found) * (STEP * scale) * (best != cost.shape[0] // 2)
 

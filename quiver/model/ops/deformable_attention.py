@@ -25,7 +25,9 @@ def deformable_attention(query: Tensor, key: Tensor, value: Tensor, offset: Tens
     _check(query, key, value, offset, heads)
     with torch.autocast(query.device.type, enabled=False):
         dtype = torch.promote_types(query.dtype, torch.float32)
-        query, offset, images = query.to(dtype), offset.to(dtype), torch.cat([key, value], dim=2).to(dtype)
+        query = query.to(dtype)
+        offset = offset.to(dtype)
+        images = torch.cat([key, value], dim=2).to(dtype)
         y, x = _positions(offset)
         rows = query.shape[2]
         if not torch.is_grad_enabled():

@@ -101,7 +101,8 @@ class Bit2Bit(nn.Module):
     def forward(self, frames: Tensor) -> Tensor:
         """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape."""
         check_frames(frames)
-        total, weights = torch.zeros_like(frames), frames.new_zeros(frames.shape[1], 1, 1, 1)
+        total = torch.zeros_like(frames)
+        weights = frames.new_zeros(frames.shape[1], 1, 1, 1)
         for start, weight in pieces(frames.shape[1]):
             part = slice(start, start + len(weight))
             factors = frames.new_tensor(weight).view(-1, 1, 1, 1)
@@ -127,7 +128,8 @@ class Bit2Bit(nn.Module):
         channels = [torch.sin(volume * 10.0**-i) for i in range(FREQUENCIES)]
         if not self.config.as_published:
             channels.append(share.to(seen.dtype).view(-1, 1, 1, 1, 1).expand_as(volume))
-        x, skips = torch.cat(channels, dim=1), []
+        x = torch.cat(channels, dim=1)
+        skips = []
         for level, block in enumerate(self.down):
             x = block(F.max_pool3d(x, 2) if level else x)
             skips.append(x)
@@ -192,7 +194,8 @@ def photon_loss(output: Tensor, parts: Split, planes: int) -> Tensor:
     saturated voxels of larger codes do not count.
     """
     admitted = (parts.seen == 0 if planes == 1 else parts.seen + parts.target < planes).flatten(1)
-    values, target = output.flatten(1), parts.target.flatten(1)
+    values = output.flatten(1)
+    target = parts.target.flatten(1)
     target = target / target.mean(dim=1, keepdim=True).clamp(min=DARKEST) * admitted
     count = admitted.sum(dim=1).clamp(min=1).to(values.dtype)
     hidden = values.masked_fill(~admitted, torch.finfo(values.dtype).min)

@@ -38,7 +38,8 @@ def restored_range(network: Any, frames: Tensor, first: int, last: int, **known:
     inputs of its `windows`. ValueError for another shape.
     """
     check_frames(frames)
-    before, count = network.frames_in - 1 - network.look_ahead, last - first + network.frames_in - 1
+    before = network.frames_in - 1 - network.look_ahead
+    count = last - first + network.frames_in - 1
     order = reflected(first - before, count, frames.shape[1])
     restored: Tensor = network.windows(pad_space(frames[:, order], network.multiple), **known)
     return restored[..., : frames.shape[-2], : frames.shape[-1]]

@@ -89,7 +89,9 @@ class EMVD(nn.Module):
         `variance` is the sensor's table, [n] or one per clip [B, n]; None: that of noise.VARIANCE.
         """
         check_frames(frames)
-        table, state, restored = table_of(variance, frames), None, []
+        table = table_of(variance, frames)
+        state = None
+        restored = []
         for image in self.packed(pad_space(frames, self.multiple)).unbind(1):
             output, state = self.step(state, image, table)
             restored.append(self.unpacked(output))
@@ -113,7 +115,8 @@ class EMVD(nn.Module):
         Height and width must be multiples of 8. The next state is the fused image, not the restored one.
         """
         old, new = (self.bands(image if x is None else x) for x in (state, image))
-        gamma, up = None, None
+        gamma = None
+        up = None
         for scale, module in zip((2, 1, 0), (self.vd, self.md1, self.md0), strict=True):
             result = module(old[scale], new[scale], table, gamma, up)
             gamma = result.gamma
@@ -125,7 +128,8 @@ class EMVD(nn.Module):
 
     def bands(self, image: Tensor) -> list[Tensor]:
         """Image [N, 4, h, w] -> its bands [N, 16, h/2, w/2], and those of the low-pass band twice more."""
-        result, low = [], self.ct(image)
+        result = []
+        low = self.ct(image)
         for _ in range(SCALES):
             result.append(self.ft(low))
             low = result[-1][:, :IMAGE]
@@ -146,8 +150,10 @@ class Scale(nn.Module):
 
     def forward(self, old: Tensor, new: Tensor, table: Tensor, gamma: Tensor | None, up: Tensor | None) -> Fused:
         """Bands of state and new frame [N, 16, h, w], coarser gamma [N, 1, h/2, w/2], its image `up` [N, 4, h, w]."""
-        old_low, new_low = old[:, :IMAGE], new[:, :IMAGE]
-        old_noise, new_noise = self.noise(old_low, table), self.noise(new_low, table)
+        old_low = old[:, :IMAGE]
+        new_low = new[:, :IMAGE]
+        old_noise = self.noise(old_low, table)
+        new_noise = self.noise(new_low, table)
         coarser = [] if gamma is None else [gamma.repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)]
         gamma = self.fusion(torch.cat([(new_low - old_low).abs(), *coarser, new_noise], dim=1))
         fused = torch.lerp(old, new, gamma)
@@ -233,12 +239,14 @@ class Synthesis(nn.Module):
     def forward(self, bands: Tensor) -> Tensor:
         """Bands [N, 4c, h, w] -> [N, c, 2h, 2w]."""
         low_low, low_high, high_low, high_high = bands.chunk(BANDS, dim=1)
-        low, high = self.joined(low_low, low_high, -2), self.joined(high_low, high_high, -2)
+        low = self.joined(low_low, low_high, -2)
+        high = self.joined(high_low, high_high, -2)
         return self.joined(low, high, -1)
 
     def joined(self, low: Tensor, high: Tensor, axis: int) -> Tensor:
         """Low and high band [..., n] of one axis -> [..., 2n]: places 0, 2 ... and 1, 3 ... interleaved."""
-        low_taps, high_taps = self.net1["weight"].flatten(), self.net2["weight"].flatten()
+        low_taps = self.net1["weight"].flatten()
+        high_taps = self.net2["weight"].flatten()
         parts = [low * low_taps[k] + high * high_taps[k] for k in (0, 1)]
         end = low.ndim + axis
         return torch.stack(parts, dim=end + 1).flatten(end, end + 1)

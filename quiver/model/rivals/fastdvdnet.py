@@ -79,7 +79,8 @@ class FastDVDnet(nn.Module):
     def windows(self, frames: Tensor, variance: Tensor | None = None) -> Tensor:
         """[B, T, 1, H, W], T >= 5, H and W multiples of 4 -> restored frames 2 ... T-3 [B, T-4, 1, H, W]."""
         maps = deviation_map(frames, table_of(variance, frames)).unbind(1) if self.config.noise_map else None
-        images, restored = frames.unbind(1), []
+        images = frames.unbind(1)
+        restored = []
         denoised: deque[Tensor] = deque(maxlen=TRIPLE)
         for t in range(1, len(images) - 1):
             denoised.append(self.first(images[t - 1 : t + 2], None if maps is None else maps[t - 1 : t + 2]))
@@ -94,7 +95,9 @@ class Block(nn.Module):
     def __init__(self, config: FastDVDnetConfig) -> None:
         """Make the layers."""
         super().__init__()
-        w, each = config.width, 15 * config.width // 16  # channels; of a frame, before the frames meet
+        # channels; of a frame, before the frames meet
+        w = config.width
+        each = 15 * config.width // 16
         normed = config.batch_norm
         self.enter = nn.Sequential(
             *_layer(TRIPLE * (1 + config.noise_map), TRIPLE * each, normed, groups=TRIPLE),

@@ -146,11 +146,13 @@ class FloRNN(nn.Module):
             return Flows(*2 * (frames.new_zeros(batch, 0, 2, height, width),))
         if self.flow is None:
             raise ValueError("this FloRNN has no flow network; give the flows, or set FloRNNConfig.flow_channels")
-        earlier, later = frames[:, :-1].flatten(0, 1), frames[:, 1:].flatten(0, 1)
+        earlier = frames[:, :-1].flatten(0, 1)
+        later = frames[:, 1:].flatten(0, 1)
         pairs = len(earlier) if torch.is_grad_enabled() else 1  # at a time: the pyramids of all take gigabytes
         parts = []
         for i in range(0, len(earlier), pairs):
-            a, b = earlier[i : i + pairs], later[i : i + pairs]
+            a = earlier[i : i + pairs]
+            b = later[i : i + pairs]
             parts.append(self.flow(torch.cat([a, b]), torch.cat([b, a]))[0].unflatten(0, (2, len(a))))
         return Flows(*(flow.unflatten(0, (batch, count - 1)) for flow in torch.cat(parts, dim=1)))
 
@@ -166,7 +168,8 @@ class FloRNN(nn.Module):
         Nothing is padded or reflected. Of the flows, N-1 forward ones and N-k-1 backward ones are used.
         """
         maps = noise.expand_as(images)
-        ahead, state = self.backward_rnn(images[:, 0], maps[:, 0]), self.forward_rnn(images[:, 0], maps[:, 0])
+        ahead = self.backward_rnn(images[:, 0], maps[:, 0])
+        state = self.forward_rnn(images[:, 0], maps[:, 0])
         kept: deque[tuple[Tensor, Tensor]] = deque(maxlen=self.look_ahead)
         restored = []
         for i in range(1, images.shape[1]):

@@ -129,7 +129,8 @@ class MemDeblur(nn.Module):
         full = self._clip(list(images.unbind(1)))
         behind, backward = self._backward_pass(full)
         outputs: list[Tensor] | None = None
-        stored, results = None, []
+        stored = None
+        results = []
         for scale, divisor in enumerate(SCALES):
             clip = full if divisor == 1 else self._clip([resize(x, *_size(x, divisor)) for x in full.images])
             outputs, stored = self._forward_pass(scale, clip, outputs, behind, backward, stored)
@@ -155,7 +156,8 @@ class MemDeblur(nn.Module):
         states: list[Tensor] = []
         stored: Stored | None = None
         for i in range(last, -1, -1):
-            feature, key = clip.features[i], clip.keys[i]
+            feature = clip.features[i]
+            key = clip.keys[i]
             if stored is None:
                 past = [_zeros(feature, FEATURES + 2 * self.config.width)]
             else:
@@ -169,11 +171,17 @@ class MemDeblur(nn.Module):
         return states[::-1], stored
 
     def _forward_pass(
-        self, scale: int, clip: Clip, coarser: list[Tensor] | None, behind: list[Tensor], backward: Stored,
+        self,
+        scale: int,
+        clip: Clip,
+        coarser: list[Tensor] | None,
+        behind: list[Tensor],
+        backward: Stored,
         stored: Stored | None,
-    ) -> tuple[list[Tensor], Stored]:  # fmt: skip
+    ) -> tuple[list[Tensor], Stored]:
         """Restored images of a scale, and the forward memory after it, which holds those of all scales."""
-        memory, outputs = self.memory, []
+        memory = self.memory
+        outputs = []
         hidden: Tensor | None = None
         for i, (image, feature, key) in enumerate(zip(*clip, strict=True)):
             parts = [feature, memory.decode_feature(memory.read(backward, key), feature)]
@@ -183,8 +191,12 @@ class MemDeblur(nn.Module):
                 parts.append(_zeros(feature, FEATURES + 3 * self.config.width))
             else:
                 of_features, of_images = memory.read(stored, key).chunk(2, dim=1)
-                parts += [clip.features[i - 1], memory.decode_feature(of_features, feature), hidden,
-                          memory.decode_image(of_images, feature)]  # fmt: skip
+                parts += [
+                    clip.features[i - 1],
+                    memory.decode_feature(of_features, feature),
+                    hidden,
+                    memory.decode_image(of_images, feature),
+                ]
             hidden = self.forward_resblocks["main"](self.forward_input_convs[scale](join(*parts)))
             fused = self.fusion(join(resize(behind[i], *feature.shape[-2:]), hidden))
             outputs.append(self.upsampling(F.leaky_relu(fused, SLOPE)) + image)

@@ -13,8 +13,23 @@ from quiver.model.config import real_number
 
 # For a network called without a table: a QIS of three bits with quantum efficiency 0.8, read noise 0.2 e- and gain
 # 1.077, to 0.9 % of the largest. White hardly fluctuates, as it is clipped.
-VARIANCE = (0.0002, 0.0107, 0.0217, 0.033, 0.0443, 0.0549, 0.064, 0.0707, 0.0742, 0.0737, 0.0687, 0.0588, 0.0437,
-            0.0235, 0.0)  # fmt: skip
+VARIANCE = (
+    0.0002,
+    0.0107,
+    0.0217,
+    0.033,
+    0.0443,
+    0.0549,
+    0.064,
+    0.0707,
+    0.0742,
+    0.0737,
+    0.0687,
+    0.0588,
+    0.0437,
+    0.0235,
+    0.0,
+)
 LEAST_VARIANCE = 1e-12  # keeps the slope of the deviation finite; a code of 16 bits rounds with 2e-11
 BOX = 5  # px, side of the square whose mean stands for the mean of a pixel
 

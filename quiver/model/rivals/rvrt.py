@@ -86,22 +86,26 @@ class RVRT(nn.Module):
         width = config.width
         self.least = QUARTER * max(2**config.flow_levels - MULTIPLE + 1, 1)  # px; the coarsest level must have two
         self.spynet = SpyNet(config.flow_levels)
-        self.feat_extract = nn.ModuleDict({
-            "1": FrameConv(1, width, 3, stride=2),
-            "3": FrameConv(width, width, 3, stride=2),
-            "6": SwinStack(width, width, blocks=1, frames=1),
-        })  # fmt: skip
+        self.feat_extract = nn.ModuleDict(
+            {
+                "1": FrameConv(1, width, 3, stride=2),
+                "3": FrameConv(width, width, 3, stride=2),
+                "6": SwinStack(width, width, blocks=1, frames=1),
+            }
+        )
         self.backbone = nn.ModuleDict(
             {name: SwinStack((2 + i) * width, width, blocks=2, frames=CLIP) for i, name in enumerate(PASSES)}
         )
         self.deform_align = nn.ModuleDict({name: Align(width) for name in PASSES})
         self.reconstruction = SwinStack((1 + len(PASSES)) * width, width, blocks=1, frames=1)
         self.conv_before_upsampler = nn.Sequential(FrameConv(width, HIDDEN, 1), nn.LeakyReLU(SLOPE))
-        self.upsampler = nn.ModuleDict({
-            "0": FrameConv(HIDDEN, 4 * HIDDEN, 3),
-            "5": FrameConv(HIDDEN, 4 * HIDDEN, 3),
-            "10": FrameConv(HIDDEN, HIDDEN, 3),
-        })  # fmt: skip
+        self.upsampler = nn.ModuleDict(
+            {
+                "0": FrameConv(HIDDEN, 4 * HIDDEN, 3),
+                "5": FrameConv(HIDDEN, 4 * HIDDEN, 3),
+                "10": FrameConv(HIDDEN, HIDDEN, 3),
+            }
+        )
         self.conv_last = FrameConv(HIDDEN, 1, 3)
 
     def forward(self, frames: Tensor) -> Tensor:
@@ -140,7 +144,8 @@ class RVRT(nn.Module):
     def flows(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """[B, T, 1, H, W] -> flows [B, T-1, 2, H/4, W/4] in px (x, y): on frame j into j+1, on frame j+1 into j."""
         small = reduced(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
-        first, second = small[:, :-1].flatten(0, 1), small[:, 1:].flatten(0, 1)
+        first = small[:, :-1].flatten(0, 1)
+        second = small[:, 1:].flatten(0, 1)
         pairs = (frames.shape[0], frames.shape[1] - 1)
         return self.spynet(first, second).unflatten(0, pairs), self.spynet(second, first).unflatten(0, pairs)
 
@@ -216,8 +221,10 @@ class Align(nn.Module):
 
     def offsets(self, query: Tensor, value: Tensor, guides: Guides) -> Tensor:
         """Return the corrections [B, frame, source, groups, taps, 2, h, w] of the guides in px, (dy, dx)."""
-        warped = [warp(frames.flatten(0, 1), flow.flatten(0, 1))
-                  for frames, flow in ((value, guides.straight), (value.flip(1), guides.crossed))]  # fmt: skip
+        warped = [
+            warp(frames.flatten(0, 1), flow.flatten(0, 1))
+            for frames, flow in ((value, guides.straight), (value.flip(1), guides.crossed))
+        ]
         seen = torch.cat([query.flatten(0, 1), *warped, *(flow.flatten(0, 1) for flow in guides)], dim=1)
         raw = self.conv_offset(seen)
         return LARGEST_RESIDUE * raw.tanh().view(*query.shape[:2], len(guides), GROUPS, TAPS, 2, *query.shape[3:])
@@ -232,7 +239,8 @@ def reduced(images: Tensor) -> Tensor:
 def composed(steps: Tensor) -> Guides:
     """Flows [B, 3, 2, h, w] between neighbours of four frames, on j+1 into j -> guides of frames 2, 3 into 0, 1."""
     f10, f21, f32 = steps.unbind(1)
-    f20, f31 = f21 + warp(f10, f21), f32 + warp(f21, f32)
+    f20 = f21 + warp(f10, f21)
+    f31 = f32 + warp(f21, f32)
     f30 = f32 + warp(f20, f32)
     return Guides(torch.stack([f20, f31], dim=1), torch.stack([f21, f30], dim=1))
 

@@ -103,7 +103,8 @@ class SwinLayer(nn.Module):
         window = min(WINDOW, height), min(WINDOW, width)
         shift = [SHIFT if self.shifted and side > WINDOW else 0 for side in (height, width)]
         x = F.pad(x, (0, 0, 0, -width % window[1], 0, -height % window[0])).roll((-shift[0], -shift[1]), (2, 3))
-        rows, columns = x.shape[2] // window[0], x.shape[3] // window[1]
+        rows = x.shape[2] // window[0]
+        columns = x.shape[3] // window[1]
         cut = x.view(count, frames, rows, window[0], columns, window[1], channels).permute(0, 2, 4, 1, 3, 5, 6)
         regions = _regions(cut.shape[1:6], shift, x.device) if any(shift) else None
         done = self.attn(cut.reshape(count, rows * columns, -1, channels), window, regions)
@@ -133,12 +134,14 @@ class SwinStack(nn.Module):
     def __init__(self, inputs: int, width: int, blocks: int, frames: int) -> None:
         """Make the layers, at their published places."""
         super().__init__()
-        self.main = nn.ModuleDict({
-            "1": FrameConv(inputs, width, 3),
-            "3": nn.LayerNorm(width),
-            "5": nn.Sequential(*(SwinBlock(width, frames) for _ in range(blocks))),
-            "7": nn.LayerNorm(width),
-        })  # fmt: skip
+        self.main = nn.ModuleDict(
+            {
+                "1": FrameConv(inputs, width, 3),
+                "3": nn.LayerNorm(width),
+                "5": nn.Sequential(*(SwinBlock(width, frames) for _ in range(blocks))),
+                "7": nn.LayerNorm(width),
+            }
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, D, inputs, H, W] -> [N, D, C, H, W]; D is the number of frames of a window."""

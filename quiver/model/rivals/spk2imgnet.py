@@ -148,7 +148,8 @@ class Extractor(nn.ModuleDict):
 
     def __init__(self, config: Spk2ImgNetConfig) -> None:
         """Make the layers."""
-        frames, width = config.group_frames, config.width
+        frames = config.group_frames
+        width = config.width
         first = {f"conv0_{branch}": _conv(frames, width // 4) for branch in range(BRANCHES)}
         second = {f"conv1_{branch}": _conv(width // 4, 1) for branch in range(BRANCHES)}
         net = nn.Sequential(*(Block(width) for _ in range(config.blocks)))

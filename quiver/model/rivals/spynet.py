@@ -13,7 +13,9 @@ from torch import Tensor, nn
 from quiver.model.deformable import warp
 
 MULTIPLE = 32  # px; images are resized to multiples of it inside
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of three channels, as published
+# of three channels, as published
+MEAN = (0.485, 0.456, 0.406)
+DEVIATION = (0.229, 0.224, 0.225)
 WIDTHS = (8, 32, 64, 32, 16, 2)
 
 

@@ -78,7 +78,8 @@ def test_slopes_of_the_law_are_its_differences():
     rng = np.random.default_rng(5)
     for smooth in (False, True):
         for _ in range(30):
-            gain, noise = float(rng.uniform(0.3, 8)), float(rng.uniform(0.3, 2))
+            gain = float(rng.uniform(0.3, 8))
+            noise = float(rng.uniform(0.3, 2))
             mean = rng.uniform(200, 600, 3) if smooth else rng.uniform(2, 40, 3)
             spread = np.minimum(np.array([-0.05, 0.1, 0.8]) * (mean + noise**2), mean**2 / 15)  # no negative light
             edges = np.unique(np.rint(gain * rng.uniform(0, 1.3 * mean.max(), 30)))
@@ -103,7 +104,8 @@ def test_series_for_bright_light_is_near_the_sum():
     """Above 150 e- the Edgeworth series differs from the exact sum by less than 1e-4 in any cumulated share."""
     rng = np.random.default_rng(6)
     for _ in range(20):
-        gain, noise = float(rng.uniform(0.2, 2)), float(rng.uniform(1.0, 5.0))
+        gain = float(rng.uniform(0.2, 2))
+        noise = float(rng.uniform(1.0, 5.0))
         mean = rng.uniform(150, 1500, 1)
         edges = np.arange(0.0, 2.0 * gain * mean[0], max(1.0, gain * 3))
         both = [code_law(edges, gain, 5.0, noise, mean, np.zeros(1), smooth=smooth) for smooth in (False, True)]

@@ -52,7 +52,8 @@ def test_dark_pattern_that_follows_the_light_does_not_bias_prnu(correlation):
     """
     rng = np.random.default_rng(4)
     pattern, other = rng.standard_normal((2, 60, 60))
-    light, dark = 0.1 * (1 + 0.04 * pattern), 0.004 + 0.0012 * (pattern if correlation else other) * (correlation or 1)
+    light = 0.1 * (1 + 0.04 * pattern)
+    dark = 0.004 + 0.0012 * (pattern if correlation else other) * (correlation or 1)
     ones = [
         rng.binomial(60000, -np.expm1(-arrivals)) for arrivals in (np.maximum(dark, 0), light + np.maximum(dark, 0))
     ]

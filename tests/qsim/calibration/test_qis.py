@@ -63,7 +63,8 @@ def test_read_noise_below_rounding_is_bounded():
 
 def test_hot_pixels_change_no_estimate():
     """Twelve pixels at 30 times the dark current or saturated: the result is nearly that of the others alone."""
-    darks, flats = ([], [])
+    darks = []
+    flats = []
     rng = np.random.default_rng(4)
     hot = np.random.default_rng(5).random((20, 20)) < 0.03
     for kind, light, exposure in ((darks, 0, 1e-3), (darks, 0, 5e-2), (flats, 2, 1e-3), (flats, 6, 1e-3)):
@@ -94,7 +95,9 @@ def test_all_zero_darks_of_a_qis_are_refused():
 def test_saturated_flats_are_refused_or_announced():
     with pytest.raises(ValueError, match="every code of flat 0 is 7"):
         calibrate_qis([statistics_of(noise(top=3))], [statistics_of(noise() * 0 + 7, photons=None)], bits=3)
-    dark, full, planes = statistics_of(noise(40, 2) * 0, 1), noise(40, 2) * 0 + 1, noise(40, 2) % 2
+    dark = statistics_of(noise(40, 2) * 0, 1)
+    full = noise(40, 2) * 0 + 1
+    planes = noise(40, 2) % 2
     with pytest.raises(ValueError, match="all frames of flat 0 are alike"):
         calibrate_spad([dark], [statistics_of(full, 1, 3.0)], bits=1)
     planes[:, :3] = 1

@@ -59,7 +59,8 @@ def test_afterpulsing_of_few_frames_is_not_too_small():
 
 def test_hot_pixels_do_not_pass_for_afterpulses():
     """2 % of the pixels have nearly all of the variance: the interval was 4 times too narrow."""
-    rng, hits = np.random.default_rng(9), 0
+    rng = np.random.default_rng(9)
+    hits = 0
     rate = np.where(np.arange(576) < 12, 0.1, 1e-3).reshape(24, 24)
     for _ in range(60):
         dark = statistics_of(rng.random((400, 24, 24)) < rate, 1)

@@ -19,7 +19,8 @@ def folder(tmp_path, monkeypatch):
 
     rng = np.random.default_rng(3)
     monkeypatch.chdir(tmp_path)
-    dark, flat = draw_planes(rng, 300, 0.01), draw_planes(rng, 300, 0.5, 0.1)
+    dark = draw_planes(rng, 300, 0.01)
+    flat = draw_planes(rng, 300, 0.5, 0.1)
     for name, planes in (("dark", dark), ("flat", flat)):
         np.save(f"{name}_planes.npy", planes.astype(np.uint8))
         sums = planes.reshape(6, 50, H, W).sum(axis=1)

@@ -28,7 +28,8 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, list[str]]]:
     found: list[tuple[str, list[str]]] = []
 
     def parse(words: list[str], capture: bool) -> str:
-        program, arguments = words[2], words[3:]
+        program = words[2]
+        arguments = words[3:]
         args = PARSERS[program].parse_args(arguments)
         found.append((program, arguments))
         if args.command == "generate":

@@ -36,7 +36,8 @@ def test_names_files_and_records_of_a_sensor_give_the_same_codes(tmp_path: Path)
     file = tmp_path / "own.toml"
     fields = "\n".join(f"{key} = {value}" for key, value in SENSOR.to_dict().items() if type(value) in (int, float))
     file.write_text(f'[sensor]\nmodel = "QIS"\n{fields}\n')
-    record, stored = clip.sense(SENSOR, ppp=2.5), clip.sense(file, ppp=2.5)
+    record = clip.sense(SENSOR, ppp=2.5)
+    stored = clip.sense(file, ppp=2.5)
     np.testing.assert_array_equal(record.codes, stored.codes)
     assert record.sensor == stored.sensor == SENSOR
     assert clip.sense("quiver-paper", ppp=2.5).sensor == QIS(0.8, 1.6, 0.2, 3)

@@ -62,7 +62,8 @@ def test_a_stream_is_one_mosaic_that_can_be_drawn_again(place):
 
 def test_a_given_sensor_needs_no_file(place):
     """Neither for its parameters nor for colour filters, of which it has none."""
-    clip, own = write_clip(place / "g"), QIS(0.8, 1.6, 0.2, 3)
+    clip = write_clip(place / "g")
+    own = QIS(0.8, 1.6, 0.2, 3)
     for file in ("gone.toml", "mine.toml"):
         draw = assemble(clip, Sensing(file, ppp=3.0), None, own)
         assert (draw.sensor, draw.colour) == (own, None)
@@ -74,7 +75,8 @@ def test_crops_keep_the_phase_of_the_mask(place):
     meta = {"camera": whole.meta["camera"], "origin": [3, 2]}
     window = write_clip(place / "w", radiance=whole.radiance(0)[None, :, 3:8, 2:9], bands=whole.meta["bands"], **meta)
     wanted = Sensing("mine.toml")
-    one, other = prepare(whole, wanted), prepare(window, wanted)
+    one = prepare(whole, wanted)
+    other = prepare(window, wanted)
     np.testing.assert_allclose(other.light(window, 0, 1), one.light(whole, 0, 1)[:, 3:8, 2:9], rtol=1e-12)
     np.testing.assert_array_equal(one.incident(whole, 0, (3, 2, 5, 7)), one.light(whole, 0, 1)[0, 3:8, 2:9])
     assert window.sense("mine.toml").colour_filter.mask == ("WB", "RG")
@@ -99,7 +101,8 @@ def test_light_behind_a_filter_is_that_of_its_band(place):
     still = np.repeat(np.random.default_rng(0).uniform(0.2, 2, (1, 3, 7, 9)), 150, axis=0)
     clip = write_clip(place / "c", radiance=still.astype(np.float32), bands=[6.1e-7, 5.4e-7, 4.6e-7])
     stream = clip.sense(QIS(1.0, 0.0, 0.0, 8), ppp=5.0, colour=ColourFilter(("RG", "GB")))
-    truth, mean = stream.truth(0, 1)[0], stream.codes().mean(axis=0)
+    truth = stream.truth(0, 1)[0]
+    mean = stream.codes().mean(axis=0)
     own = np.array([[truth["RGB".index("RGGB"[2 * (y % 2) + x % 2]), y, x] for x in range(9)] for y in range(7)])
     assert (np.abs(mean - own) < 5 * np.sqrt(own / 150)).all()
 

@@ -36,7 +36,8 @@ def test_a_gate_takes_the_middle_of_the_slices():
     rng = np.random.default_rng(3)
     moments = (np.arange(100_000) + 0.5) / 100_000
     for _ in range(50):
-        share, slices = 1 - rng.random(), int(rng.integers(1, 20))
+        share = 1 - rng.random()
+        slices = int(rng.integers(1, 20))
         inside = np.abs(moments - 0.5) <= share / 2
         counted = np.bincount((moments[inside] * slices).astype(int), minlength=slices) * slices / moments.size
         np.testing.assert_allclose(gates.weights(share, slices), counted, atol=3e-5 * slices)
@@ -74,8 +75,10 @@ def test_codes_have_the_law_of_their_exposure(tmp_path, kind):
     codes = draw.frames(clip, 0, draw.count(clip))
     for t, drawn in enumerate(codes):
         share = SCHEDULE[t % 3]
-        light, exposure = np.array([6.0 * share]), clip.exposure * draw.planes * share
-        mean, variance = sensor.mean(light, exposure), sensor.variance(light, exposure)
+        light = np.array([6.0 * share])
+        exposure = clip.exposure * draw.planes * share
+        mean = sensor.mean(light, exposure)
+        variance = sensor.variance(light, exposure)
         assert_mean(drawn, float(mean[0]), float(variance[0]), checks=len(codes))
 
 

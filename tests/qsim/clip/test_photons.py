@@ -36,7 +36,8 @@ def test_light_levels(tmp_path: Path):
 
 def test_light_beyond_the_sensor_models_is_refused(tmp_path: Path):
     """A QIS showed no more light above 1e15 electrons, without a word."""
-    clip, video = write(tmp_path / "a"), write(tmp_path / "r", radiance_unit=RELATIVE, camera=None)
+    clip = write(tmp_path / "a")
+    video = write(tmp_path / "r", radiance_unit=RELATIVE, camera=None)
     for levels in ({"ppp": 1e17}, {"lux": 1e17}):
         with pytest.raises(ValueError, match=r"a: .* photons per pixel and frame are too many; give at most 1e\+12"):
             light_level(clip, **levels)

@@ -67,7 +67,9 @@ def test_every_pixel_sees_its_own_interval_of_the_light(tmp_path, order, kind):
 @pytest.mark.parametrize("order", ROW_ORDERS)
 def test_a_moving_edge_leans_by_speed_times_delay(tmp_path, order):
     """An edge that moves 3/8 px per frame: its place in each line is speed x (frame + delay of the line), exactly."""
-    speed, height, width = 0.375, 16, 24
+    speed = 0.375
+    height = 16
+    width = 24
     along = np.arange(width if order in ("down", "up") else height)
     covered = np.clip(2.0 + speed * np.arange(12)[:, None] - along, 0, 1)  # exact in half precision
     shape = (12, height, width)
@@ -83,7 +85,9 @@ def test_a_moving_edge_leans_by_speed_times_delay(tmp_path, order):
 
 def test_interpolated_rows_approach_rows_rendered_at_their_instants(tmp_path):
     """Against a clip of 32 times the rate, the error of codes of n clip frames falls as n^-3/2 or faster."""
-    height, width, fine = 9, 40, 32
+    height = 9
+    width = 40
+    fine = 32
     exact = sliding_pattern(4 * fine, height, width, 3, speed=3.0 / fine)
     rows = Rows(1 / RATE / 10)
     errors = []
@@ -170,7 +174,8 @@ def test_rows_read_no_frame_beyond_their_reach(tmp_path):
     assert draw.frames(clip, 0, 1).shape == (1, 101, 2)
     rng = np.random.default_rng(0)
     for _ in range(300):
-        rows, rate = Rows(int(rng.integers(1, 500)) * 1e-6), float(rng.choice([500, 2000, 30000, 96800]))
+        rows = Rows(int(rng.integers(1, 500)) * 1e-6)
+        rate = float(rng.choice([500, 2000, 30000, 96800]))
         height = int(rng.integers(1, 300))
         frames = []
 

@@ -31,7 +31,9 @@ def checksum(codes: np.ndarray) -> str:
 
 def sense_again(path: Path, seed: int, seconds: float, answers: multiprocessing.Queue) -> None:
     """Replace and read the stream `same` repeatedly; half of the reads follow at once, half after a delay."""
-    clip, rng, found = Clip.open(path), random.Random(seed), Counter[str]()
+    clip = Clip.open(path)
+    rng = random.Random(seed)
+    found = Counter[str]()
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if seed < 4:
@@ -79,7 +81,9 @@ def test_no_reader_sees_codes_of_another_seed_than_its_json(tmp_path: Path, seco
 
 def sense_first(path: Path, start: float, answers: multiprocessing.Queue) -> None:
     """Sense a stream at the same time as the other processes."""
-    clip, waits, drawn = Clip.open(path), [], []
+    clip = Clip.open(path)
+    waits = []
+    drawn = []
     time.sleep(max(0.0, start - time.monotonic()))
     try:
         made, _ = sense(
@@ -107,7 +111,8 @@ def test_a_replaced_stream_is_reported_and_a_mapped_one_stays(tmp_path: Path):
     clip = write_clip(tmp_path / "c", frames=3)
     wanted = [Sensing("quiver-physical", 3, 3.25, seed=seed, name="same") for seed in (1, 2)]
     first, _ = sense(clip, wanted[0])
-    mapped, unread = clip.stream("same"), clip.stream("same")
+    mapped = clip.stream("same")
+    unread = clip.stream("same")
     before = mapped.codes()
     second, _ = sense(clip, wanted[1], force=True)
     np.testing.assert_array_equal(mapped.codes(), before)

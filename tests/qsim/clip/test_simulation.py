@@ -107,7 +107,9 @@ def test_what_a_spike_camera_does_not_model_is_refused(clip, tmp_path):
 
 # ---- Clips that are a crop of the frame
 
-BITS3, PLANE, COUNTER = QIS(0.8, 1.6, 0.2, 3), BinarySPAD(0.5, 200.0), CountingSPAD(0.5, 10.0, 5e-5, 3)
+BITS3 = QIS(0.8, 1.6, 0.2, 3)
+PLANE = BinarySPAD(0.5, 200.0)
+COUNTER = CountingSPAD(0.5, 10.0, 5e-5, 3)
 PATTERN = FixedPattern(device_seed=4, prnu=0.2, dark=DarkSpread(hot_share=0.1), dead=0.1)
 CROPPED: dict[str, tuple[Sensor, dict[str, Any]]] = {
     "table": (BITS3, {}),

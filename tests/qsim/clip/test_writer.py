@@ -100,7 +100,8 @@ def test_a_clip_that_only_lacks_the_rename_is_not_made_again(tmp_path: Path, mon
         with pytest.raises(KeyboardInterrupt):
             write(tmp_path / "a")
     frame = part / "radiance" / "000000.exr"
-    made, kept = frame.stat().st_ino, frame.read_bytes()
+    made = frame.stat().st_ino
+    kept = frame.read_bytes()
     with pytest.raises(ValueError, match=r"a\.part: 5 frames exist, begun with other settings"):
         write(tmp_path / "a", shape=[FRAMES - 1, HEIGHT, WIDTH])
     assert interrupted(tmp_path / "a") == list(range(FRAMES))

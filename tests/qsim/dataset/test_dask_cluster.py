@@ -89,7 +89,8 @@ def test_a_killed_workers_job_is_finished_by_the_other_and_gives_the_files_of_a_
     tmp_path: Path, cluster: LocalCluster
 ):
     generate(SMALL, tmp_path / "local", Options(workers=0), make=make)
-    first, second = cluster.worker(), cluster.worker()
+    first = cluster.worker()
+    second = cluster.worker()
     folder = tmp_path / "far"
     folder.mkdir()
     with ThreadPoolExecutor() as pool:
@@ -150,7 +151,8 @@ def test_failures_on_the_cluster_are_listed(tmp_path: Path, cluster: LocalCluste
 @pytest.mark.slow
 def test_a_worker_without_the_resource_gets_no_job(tmp_path: Path, cluster: LocalCluster):
     """It is idle all the time, while the other has more jobs than it can run at once."""
-    plain, gifted = cluster.worker(), cluster.worker("--resources", "GPU=1")
+    plain = cluster.worker()
+    gifted = cluster.worker("--resources", "GPU=1")
     cluster.wait_for_workers(2)
     run = Cluster(cluster.address, gpus=1, timeout=PATIENCE)
     assert generate(SMALL, tmp_path / "d", make=make_slowly, run=run).made == 7

@@ -80,7 +80,8 @@ def test_killed_before_every_step(tmp_path: Path, every: int):
     one = recipe.parse(f"{head}[[scenes]]{tumble}".replace("[1, 3]", "[3]"))
     generate(one, tmp_path / "undisturbed", HERE, make=make)
     expected = tree(tmp_path / "undisturbed")
-    killed, steps = True, 0
+    killed = True
+    steps = 0
     while killed:
         folder = tmp_path / str(steps)
         steps += every
@@ -121,7 +122,8 @@ def test_a_note_of_failure_that_cannot_be_read_stops_nothing(tmp_path: Path, und
 
 def test_a_job_whose_worker_crashed_after_its_record_is_done(tmp_path: Path, undisturbed: dict[str, bytes]):
     """Its note of failure stayed for ever, because --retry runs no job that has a record."""
-    folder, why = tmp_path / "d", "its worker process crashed 2 times"
+    folder = tmp_path / "d"
+    why = "its worker process crashed 2 times"
 
     def run(chosen, place, maker):
         for job in chosen:
@@ -250,7 +252,8 @@ def test_jumps_of_the_clock_change_nothing(tmp_path: Path, monkeypatch: pytest.M
     """The wall clock and the times of files jump by years between and during two runs: the same bytes."""
     wanted = recipe.parse(RECIPE)
     generate(wanted, tmp_path / "undisturbed", HERE, make=make)
-    rng, now = random.Random(0), time.time
+    rng = random.Random(0)
+    now = time.time
     monkeypatch.setattr(time, "time", lambda: now() + rng.uniform(-1e9, 1e9))
 
     def make_then_shake(job: Job, path: Path) -> object:
@@ -295,7 +298,8 @@ LIES = {  # name -> what a worker does to a job's files before it reports "done"
 
 @pytest.mark.parametrize("lie", LIES)
 def test_an_answer_counts_only_when_its_files_agree(tmp_path: Path, lie: str):
-    wanted, folder = recipe.parse(RECIPE), tmp_path / "d"
+    wanted = recipe.parse(RECIPE)
+    folder = tmp_path / "d"
 
     def run(chosen, place, maker):
         for job in reversed(chosen):

@@ -21,7 +21,8 @@ ALIKE = ALIKE.replace("frames = 3", "frames = 1")
 
 def halting(outer: Job, inner: Job, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch):
     """Return an `os.fsync` that runs the job `inner` while `outer` syncs its record, and once after `count` syncs."""
-    sync, left = os.fsync, [count]
+    sync = os.fsync
+    left = [count]
 
     def halted(descriptor: int) -> None:
         place = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
@@ -46,7 +47,8 @@ def test_no_job_tidies_up_what_another_one_is_writing(tmp_path: Path, monkeypatc
     alike = ("fan_0000", "fan_0000_x2", "fan_0000_x2.5", "fan_1000", "fan_10000")
     chosen = [job for job in wanted.jobs if job.name in alike]
     assert len(chosen) == len(alike)
-    folder, rng = tmp_path / "d", random.Random(0)
+    folder = tmp_path / "d"
+    rng = random.Random(0)
     generate(wanted, folder, HERE, make=make)
     expected = tree(folder)
     (folder / "clips").rename(tmp_path / "clips")
@@ -65,7 +67,9 @@ def test_no_job_tidies_up_what_another_one_is_writing(tmp_path: Path, monkeypatc
 
 def test_a_link_whose_disk_is_not_there(tmp_path: Path):
     """The job is listed, not rendered in vain; when the disk is back, --retry is enough."""
-    wanted, folder, place = recipe.parse(RECIPE), tmp_path / "d", tmp_path / "disk2"
+    wanted = recipe.parse(RECIPE)
+    folder = tmp_path / "d"
+    place = tmp_path / "disk2"
     generate(wanted, folder, HERE, make=make)
     moved(folder, "fan_0000", place)
     place.rename(tmp_path / "unplugged")
@@ -79,7 +83,9 @@ def test_a_link_whose_disk_is_not_there(tmp_path: Path):
 
 
 def test_a_leftover_link_of_an_earlier_version_does_not_stop_the_job(tmp_path: Path):
-    wanted, folder, place = recipe.parse(RECIPE), tmp_path / "d", tmp_path / "disk2"
+    wanted = recipe.parse(RECIPE)
+    folder = tmp_path / "d"
+    place = tmp_path / "disk2"
     generate(wanted, folder, HERE, make=make)
     moved(folder, "fan_0000", place).rename(folder / "clips" / "fan_0000.removed-77")
     (folder / "jobs" / "fan_0000.json").unlink()
@@ -104,7 +110,8 @@ def test_a_systems_error_is_worded_with_its_file_and_nothing_else(tmp_path: Path
 
 def failing(name: str, step: int, number: int, monkeypatch: pytest.MonkeyPatch):
     """Return an executor of one job in which one call of os.NAME fails."""
-    action, left = getattr(os, name), [step]
+    action = getattr(os, name)
+    left = [step]
 
     def fail(*args, **kwargs):
         left[0] -= 1

@@ -105,11 +105,13 @@ def test_an_unknown_law_is_refused(clip, tmp_path):
 
 def as_the_shifted_sums_drew(sensor: QIS, photons: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return codes of float32 sums with one factor exp(-shift) in every weight, which underflows."""
-    f, steps = np.float32, sensor.short_sums()
+    f = np.float32
+    steps = sensor.short_sums()
     n = len(steps.full)
     shift = n + 7 * np.sqrt(n) + 30 - 85
     mean = (photons * sensor.efficiency).astype(f)
-    weight, terms = np.full(mean.shape, np.exp(-shift), f), []
+    weight = np.full(mean.shape, np.exp(-shift), f)
+    terms = []
     for _ in range(n):
         terms.append(np.where(weight < 2.0**-126, f(0), weight))
         weight = (terms[-1] * (mean / f(steps.scale))).astype(f)

@@ -79,7 +79,8 @@ def test_repair_names_the_streams_that_go_with_a_clip(tmp_path: Path):
 
 def test_repair_leaves_a_clip_with_files_of_yours(tmp_path: Path):
     """It deleted them; it is refused before anything is deleted."""
-    folder, again = tmp_path / "d", Options(workers=0, repair=True)
+    folder = tmp_path / "d"
+    again = Options(workers=0, repair=True)
     generate(SMALL, folder, HERE, make=make)
     note = folder / "clips" / "tumble_0004" / "notes.txt"
     note.write_text("mine")
@@ -118,7 +119,9 @@ def test_repairing_a_stream_does_not_render(tmp_path: Path, undisturbed: dict[st
 
 def test_a_clip_that_was_moved_and_linked(tmp_path: Path):
     """It is read and its streams are repaired through the link; a repair that needs a new clip is refused."""
-    wanted, folder, place = recipe.parse(RECIPE), tmp_path / "d", tmp_path / "disk2"
+    wanted = recipe.parse(RECIPE)
+    folder = tmp_path / "d"
+    place = tmp_path / "disk2"
     generate(wanted, folder, HERE, make=make)
     expected = tree(folder)
     link = moved(folder, "fan_0000", place)
@@ -147,7 +150,8 @@ def test_a_clip_that_was_moved_and_linked(tmp_path: Path):
 
 def test_the_folder_of_the_recipe_may_move(tmp_path: Path):
     """Streams of a sensor's file, with a measured map, are kept beside one that is made again."""
-    place, folder = tmp_path / "a", tmp_path / "d"
+    place = tmp_path / "a"
+    folder = tmp_path / "d"
     place.mkdir()
     np.save(place / "bad.npy", np.eye(8, 10) > 0)
     (place / "my.toml").write_text(SENSOR)

@@ -165,7 +165,8 @@ def test_families_of_the_library_read_nothing_and_folders_everything(tmp_path: P
 
 def edit(file: Path, rng: random.Random) -> None:
     """Change a file at random and keep its size and times: setting the clock back hides nothing."""
-    status, content = file.stat(), bytearray(file.read_bytes())
+    status = file.stat()
+    content = bytearray(file.read_bytes())
     if content:
         content[rng.randrange(len(content))] ^= 1
         file.write_bytes(bytes(content))
@@ -181,7 +182,9 @@ def wanted(path: Path) -> recipe.Recipe:
 
 @pytest.mark.parametrize("name", sorted(READ))
 def test_an_edit_of_any_file_read_is_refused_by_name(place: Path, tmp_path: Path, name: str):
-    path, folder, rng = write_scene(place), tmp_path / "d", random.Random(name)
+    path = write_scene(place)
+    folder = tmp_path / "d"
+    rng = random.Random(name)
     found = wanted(path)
     own = only(found, "wheel")
     assert generate(own, folder, HERE, make=make).failed == {}

@@ -74,7 +74,8 @@ def test_a_camera_path_replaces_the_camera_of_a_scene(tmp_path: Path):
 
 def test_a_temporary_clip_lasts_as_long_as_its_streams():
     clip = render("fan", **QUICK)
-    stream, folder = clip.sense(ppp=3.25), clip.path.parent
+    stream = clip.sense(ppp=3.25)
+    folder = clip.path.parent
     again = clip.stream(stream.name)
     del clip, stream
     gc.collect()

@@ -63,7 +63,8 @@ def test_a_crashing_worker_takes_down_only_its_job(tmp_path: Path, maker: Render
 @pytest.mark.parametrize("part", [None, *(pytest.param(part, marks=pytest.mark.slow) for part in ("locks", "jobs"))])
 def test_a_folder_that_is_removed_while_workers_write(tmp_path: Path, part: str | None, capfd):
     """One line, no worker's traceback; the rest is a data set for the next run, which makes the same files."""
-    wanted, folder = recipe.parse(RECIPE.replace("[0, 1]", "[0, 1, 2, 3, 5, 6]")), tmp_path / "d"
+    wanted = recipe.parse(RECIPE.replace("[0, 1]", "[0, 1, 2, 3, 5, 6]"))
+    folder = tmp_path / "d"
     stop = threading.Event()
 
     def remove() -> None:

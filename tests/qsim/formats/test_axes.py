@@ -44,7 +44,8 @@ def test_channels_and_slices_of_a_tiff_are_no_frames(tmp_path: Path, axes: str, 
     """[4, 2, 16, 20] of axes TCYX gave 8 frames."""
     import tifffile
 
-    path, stored = tmp_path / "a.tif", random_frames(axes)
+    path = tmp_path / "a.tif"
+    stored = random_frames(axes)
     tifffile.imwrite(path, stored, photometric="minisblack", metadata={"axes": axes}, **{kind: True})
     with pytest.raises(
         ValueError, match=f"frames have one axis beside rows and columns; .*--{'channel' if 'C' in axes else 'slice'} 0"
@@ -97,7 +98,8 @@ def test_axes_that_do_not_fit_are_refused(tmp_path: Path):
 def test_hdf5_reads_only_what_lies_in_the_file(tmp_path: Path):
     h5py = pytest.importorskip("h5py")
     frames = random_frames("TYX")
-    path, other = tmp_path / "a.h5", tmp_path / "other.h5"
+    path = tmp_path / "a.h5"
+    other = tmp_path / "other.h5"
     with h5py.File(other, "w") as file:
         file["secret"] = frames
     with h5py.File(path, "w") as file:

@@ -182,8 +182,10 @@ def test_damaged_cubes_are_refused_in_one_line(tmp_path):
     """Every shortened file and every wrong width is refused; a changed header is refused or read as an array."""
     clip = three_bands(tmp_path / "clip")
     exporting.export(clip, tmp_path / "out", Export("challenge", planes=9))
-    path, side = tmp_path / "out" / "000000.npy", tmp_path / "out" / "meta.json"
-    good, stated = path.read_bytes(), json.loads(side.read_text())
+    path = tmp_path / "out" / "000000.npy"
+    side = tmp_path / "out" / "meta.json"
+    good = path.read_bytes()
+    stated = json.loads(side.read_text())
     for length in (0, 1, 60, 127, 128, len(good) - 1):
         path.write_bytes(good[:length])
         with pytest.raises(ValueError, match=r"000000\.npy") as caught:

@@ -81,7 +81,8 @@ def test_recordings_of_one_name_are_refused_before_any_is_read(tmp_path: Path, c
         images.write_png(tmp_path / "in" / name, iter(np.zeros((1, 9, 7), np.uint8)))
     options = ["--frame-rate", "1000", "--transfer", "srgb", *force]
     assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), *options]) == 2
-    both, target = f"{tmp_path / 'in' / 'a b'} and {tmp_path / 'in' / 'a_b'}", tmp_path / "out" / "a_b"
+    both = f"{tmp_path / 'in' / 'a b'} and {tmp_path / 'in' / 'a_b'}"
+    target = tmp_path / "out" / "a_b"
     assert f"{both} would both become {target}; rename one" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

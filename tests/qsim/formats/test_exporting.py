@@ -215,7 +215,9 @@ def test_an_export_states_what_decides_its_codes(tmp_path: Path):
 
 
 def test_an_export_does_not_replace_what_appeared_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    clip, target, real = write_clip(tmp_path / "clip", frames=2), tmp_path / "out", exporting.EXPORTS["png"]
+    clip = write_clip(tmp_path / "clip", frames=2)
+    target = tmp_path / "out"
+    real = exporting.EXPORTS["png"]
 
     def slow(*words: object) -> None:
         real(*words)
@@ -233,7 +235,8 @@ def test_an_export_does_not_replace_what_appeared_meanwhile(tmp_path: Path, monk
 def test_nothing_is_written_into_a_clip(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """The description of an export in `streams` counted as a stream without codes."""
     clip = write_clip(tmp_path / "clip", frames=2, height=6, width=8)
-    stream, inside = clip.sense(BinarySPAD(0.4, 20.0), ppp=1.0), clip.path / "streams"
+    stream = clip.sense(BinarySPAD(0.4, 20.0), ppp=1.0)
+    inside = clip.path / "streams"
     np.save(tmp_path / "planes.npy", stream.codes() > 0)
     np.save(tmp_path / "light.npy", np.ones((2, 6, 8), np.float32))
     for words in (
@@ -254,7 +257,8 @@ def test_nothing_is_written_into_a_clip(tmp_path: Path, capsys: pytest.CaptureFi
 def test_a_killed_export_is_made_again(tmp_path: Path, monkeypatch):
     """What the killed one left is provably ours, lies under no name of the user, and is gone after the next."""
     clip = clip_of(tmp_path / "clip", np.random.default_rng(0).random((3, 6, 8)).astype(np.float32))
-    written, target = exporting._light_blocks, tmp_path / "out"
+    written = exporting._light_blocks
+    target = tmp_path / "out"
 
     def killed(source: Clip):
         yield from written(source)

@@ -135,7 +135,8 @@ def test_tiff_of_other_colours_is_not_read_as_grey_or_rgb(tmp_path: Path):
     """Indices of a palette were light, cyan was red; --bits says that the indices are codes."""
     import tifffile
 
-    path, pixels = tmp_path / "a.tif", np.random.default_rng(0).integers(0, 256, (9, 7, 4)).astype(np.uint8)
+    path = tmp_path / "a.tif"
+    pixels = np.random.default_rng(0).integers(0, 256, (9, 7, 4)).astype(np.uint8)
     table = np.random.default_rng(1).integers(0, 65536, (3, 256)).astype(np.uint16)
     tifffile.imwrite(path, pixels, photometric="separated")
     with pytest.raises(ValueError, match=r"a\.tif: page 0 holds SEPARATED pixels; save it as grey or RGB"):

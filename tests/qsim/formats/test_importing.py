@@ -44,7 +44,8 @@ def test_captures_without_sense():
 def test_wrong_kinds_are_refused_with_advice(tmp_path: Path):
     np.save(tmp_path / "planes.npy", np.ones((2, 3, 4), bool))
     np.save(tmp_path / "light.npy", np.ones((2, 3, 4), np.float32))
-    codes, light = importing.read(tmp_path / "planes.npy"), importing.read(tmp_path / "light.npy")
+    codes = importing.read(tmp_path / "planes.npy")
+    light = importing.read(tmp_path / "light.npy")
     with pytest.raises(ValueError, match="holds codes, not light"):
         importing.to_clip(codes, tmp_path / "c", CAPTURE)
     with pytest.raises(ValueError, match="holds light, not codes"):
@@ -104,7 +105,8 @@ def test_an_interrupted_import_is_not_finished_with_another_recording(tmp_path: 
     for name in ("first", "second"):
         np.save(tmp_path / f"{name}.npy", rng.uniform(0, 0.8, (4, 5, 6)).astype(np.float32) + (name == "first"))
     first, second = (importing.read(tmp_path / f"{name}.npy", Hints(white=0.9)) for name in ("first", "second"))
-    add, begun = ClipWriter.add, tmp_path / "clip.part" / "radiance" / "000000.exr"
+    add = ClipWriter.add
+    begun = tmp_path / "clip.part" / "radiance" / "000000.exr"
 
     def stop(writer: ClipWriter, t: int, *images: np.ndarray, **more: np.ndarray) -> None:
         if t == 2:
@@ -193,7 +195,8 @@ def test_saturated_pixels_are_counted_marked_and_reported(
     values[1] = np.minimum(values[1], 39)  # one frame without any
     values[2, 0, 0] = 255
     shown = np.where(values == 255, full, values) if full else values / 255
-    source, mask = tmp_path / "in", values >= (white or 255)
+    source = tmp_path / "in"
+    mask = values >= (white or 255)
     source.mkdir()
     if kind in ("png8", "png16", "colour"):
         for t, image in enumerate(shown.astype(np.uint16 if kind == "png16" else np.uint8)):

@@ -95,7 +95,8 @@ def test_clocked_codes_have_the_law_of_the_clocked_sensor(tmp_path, bits: int):
 
 def test_the_clocked_sensor_ignores_dead_time_and_afterpulses(tmp_path):
     """By hand: an arrival while the counter is dead fires a plane, a released carrier does not."""
-    times, kind = np.array([1e-5, 2e-5, 3e-4, 6.5e-4]), np.array([1, 0, 3, 1], np.uint8)
+    times = np.array([1e-5, 2e-5, 3e-4, 6.5e-4])
+    kind = np.array([1, 0, 3, 1], np.uint8)
     found = photon_times.PhotonTimes((2, 1, 1), 5e-4, 2000.0, times, kind, np.array([0, 4]))
     assert found.counts().ravel().tolist() == [2, 1]
     assert found.clocked(1).ravel().tolist() == [True, True]
@@ -130,7 +131,8 @@ def test_one_command_writes_times_and_another_reads_clocked_codes(tmp_path, caps
 
 def test_rates_in_the_file_are_used_and_none_may_contradict(tmp_path, capsys):
     meta = {"format": photon_times.FORMAT, "shape": [2, 4, 4], "exposure": 4e-4, "frame_rate": 1e3}
-    text, kind = np.frombuffer(json.dumps(meta).encode(), np.uint8), np.ones(16, np.uint8)
+    text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+    kind = np.ones(16, np.uint8)
     np.savez(tmp_path / "p.npz", times=np.linspace(0, 3e-4, 16), kind=kind, first=np.arange(17), meta=text)
     words = ["convert", str(tmp_path / "p.npz"), str(tmp_path / "clocked"), "--bits", "2", "--force"]
     for agreeing in ([], ["--frame-rate", "1000"], ["--exposure", "4e-4", "--frame-rate", "1e3"]):

@@ -47,7 +47,8 @@ def test_any_layout_is_read_as_it_was_written(tmp_path_factory: pytest.TempPathF
         st.integers(1 if kind == "packed" else 2, 16).filter(lambda b: kind == "whole" or b not in (8, 16))
     )
     first = data.draw(st.sampled_from(["msb", "lsb"] if kind == "packed" else ["big", "little"]))
-    skip, padding = data.draw(st.integers(0, 9)), data.draw(st.none() | st.integers(0, 3))
+    skip = data.draw(st.integers(0, 9))
+    padding = data.draw(st.none() | st.integers(0, 3))
     shape = data.draw(st.tuples(*[st.integers(1, 5)] * 2, st.integers(1, 19)))
     frames = np.random.default_rng(data.draw(st.integers(0, 99))).integers(0, 1 << bits, shape)
     path = tmp_path_factory.mktemp("raw") / "a.bin"

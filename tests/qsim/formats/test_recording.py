@@ -102,7 +102,9 @@ def sample(folder: Path, layout: str) -> tuple[Path, Hints]:
     elif layout == "photons":
         path = folder / "a.npz"
         meta = {"format": photon_times.FORMAT, "shape": [2, 16, 16], "exposure": 1e-3, "frame_rate": 1e3}
-        first, kind = np.arange(257), np.ones(256, np.uint8)  # one photon for each pixel
+        # one photon for each pixel
+        first = np.arange(257)
+        kind = np.ones(256, np.uint8)
         text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         np.savez(path, times=np.linspace(0, 1.9e-3, 256), kind=kind, first=first, meta=text)
     elif layout == "hdf5":

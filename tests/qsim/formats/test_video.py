@@ -158,7 +158,8 @@ def decoded(rgb: np.ndarray, matrix: str, full_range: bool) -> tuple[np.ndarray,
     _, red, blue = MATRICES[matrix]
     green = 1 - red - blue
     luma, chroma = (0.5, 0.5) if full_range else (0.5 * 255 / 219, 0.5 * 255 / 224)
-    of_red, of_blue = 2 * (1 - red) * chroma, 2 * (1 - blue) * chroma
+    of_red = 2 * (1 - red) * chroma
+    of_blue = 2 * (1 - blue) * chroma
     rounding = luma + np.array([of_red, (red * of_red + blue * of_blue) / green, of_blue])
     return rgb - rounding - np.array([2, 3, 2]), rgb + rounding
 
@@ -186,7 +187,8 @@ def test_colour_video_becomes_linear_luminance(tmp_path: Path, matrix: str, full
     found = np.stack([clip.radiance(t) for t in range(len(clip))])[:, kept]
     colours = rgb[:, kept].astype(float)
     low, high = (luminance(bound, transfer) for bound in decoded(colours, matrix, full_range))
-    low, high = low * (1 - 2**-11), high * (1 + 2**-11)
+    low = low * (1 - 2**-11)
+    high = high * (1 + 2**-11)
     assert ((low <= found) & (found <= high)).all()
     weighted_first = (colours @ np.array([0.2126, 0.7152, 0.0722]))[..., None].repeat(3, axis=-1)
     other_matrix = from_ycbcr(*to_ycbcr(colours, matrix), "bt601" if matrix == "bt709" else "bt709")

@@ -19,7 +19,8 @@ from quiver.data.clips import open_clips
 @pytest.fixture
 def pictures(tmp_path: Path) -> Path:
     """Two coloured pictures and a licence."""
-    folder, rng = tmp_path / "pictures", np.random.default_rng(0)
+    folder = tmp_path / "pictures"
+    rng = np.random.default_rng(0)
     folder.mkdir()
     for name in ("a.png", "b.jpg"):
         soft = ndimage.gaussian_filter(rng.random((150, 170, 3)), (3, 3, 0))
@@ -40,7 +41,8 @@ def test_flow_leads_to_the_same_light():
     soft = [ndimage.gaussian_filter(rng.random((300, 300)), 8, mode="wrap") * 3 for _ in range(2)]
     inside = 0
     for _ in range(8):
-        parts, time = layers(soft, (60, 70), 8.0, rng), float(rng.uniform(-4, 4))
+        parts = layers(soft, (60, 70), 8.0, rng)
+        time = float(rng.uniform(-4, 4))
         now, flow, valid = frame(parts, (60, 70), time)
         later = frame(parts, (60, 70), time + 1)[0]
         y, x = np.mgrid[:60, :70]
@@ -62,7 +64,8 @@ def test_a_layer_that_slides_moves_by_its_speed():
 
 def test_the_largest_motion_is_kept_and_some_clips_are_still():
     """Two hundred draws at 16 px/frame: no pixel moves twice that far, some clips rest, half move 3 px or more."""
-    rng, flat = np.random.default_rng(3), [np.ones((64, 64))]
+    rng = np.random.default_rng(3)
+    flat = [np.ones((64, 64))]
     largest = []
     for _ in range(200):
         flow = frame(layers(flat, (30, 30), 16.0, rng), (30, 30), float(rng.uniform(-8, 8)))[1]

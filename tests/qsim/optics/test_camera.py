@@ -101,10 +101,13 @@ def test_a_thin_lens_obeys_its_laws():
     rng = np.random.default_rng(5)
     for _ in range(100):
         camera = thin(rng)
-        f, s, v = camera.focal_length, camera.focus, camera.image_distance
+        f = camera.focal_length
+        s = camera.focus
+        v = camera.image_distance
         assert 1 / s + 1 / v == pytest.approx(1 / f, rel=1e-12)
         assert camera.focal_pixels == pytest.approx(v / 1e-5)
-        depth, pupil = s * rng.uniform(0.3, 5), f / camera.f_number
+        depth = s * rng.uniform(0.3, 5)
+        pupil = f / camera.f_number
         circle = pupil * f * abs(depth - s) / (depth * (s - f)) / 1e-5
         assert float(camera.circle_of_confusion(depth)) == pytest.approx(circle, rel=1e-9)
         irradiance = radiometry.to_irradiance(np.array(3.0), camera)

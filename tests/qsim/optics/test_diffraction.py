@@ -54,7 +54,9 @@ def test_waves_keep_the_contrast_of_lens_and_pixel():
     """Rendered waves (means over the pixels, in closed form) of any lens, pitch, colour and angle."""
     rng = np.random.default_rng(1)
     for _ in range(60):
-        camera, angle, frequency = drawn_camera(rng), rng.uniform(0, np.pi), rng.uniform(0.05, 0.45)
+        camera = drawn_camera(rng)
+        angle = rng.uniform(0, np.pi)
+        frequency = rng.uniform(0.05, 0.45)
         along = waves(128, frequency, angle)
         pixel = np.sinc(frequency * np.cos(angle)) * np.sinc(frequency * np.sin(angle))
         rendered = 1 + pixel * (np.array([0.6, 0.8]) @ along.reshape(2, -1)).reshape(128, 128)
@@ -66,7 +68,9 @@ def test_waves_keep_the_contrast_of_lens_and_pixel():
 @pytest.mark.parametrize(("f_number", "frequency", "angle"), [(1.4, 0.11, 0.2), (2.8, 0.297, 0.37), (5.6, 0.2, 1.1)])
 def test_slanted_bars_keep_the_contrast_of_a_fine_airy_pattern(f_number, frequency, angle):
     """Bars drawn on a grid 11 times finer, convolved there with the Airy pattern, and averaged over pixels."""
-    camera, fine, size = dataclasses.replace(CAMERA, f_number=f_number), 11, 96
+    camera = dataclasses.replace(CAMERA, f_number=f_number)
+    fine = 11
+    size = 96
     y, x = (np.mgrid[: size * fine, : size * fine] + 0.5) / fine - 0.5
     bars = np.cos(2 * np.pi * frequency * (x * np.cos(angle) + y * np.sin(angle))) > 0
     reach = 20 * fine

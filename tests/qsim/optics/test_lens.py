@@ -21,7 +21,8 @@ def random_lens(rng: np.random.Generator) -> Lens:
 
 def widest(lens: Lens) -> float:
     """Return the length of slopes seen, before the aspect, up to which `check` allows a picture, at most 3."""
-    allowed, refused = 0.0, 3.0
+    allowed = 0.0
+    refused = 3.0
     for corner in (3.0, *np.repeat(np.nan, 24)):
         corner = corner if np.isfinite(corner) else (allowed + refused) / 2
         try:
@@ -69,13 +70,15 @@ def test_slopes_are_seen_by_the_formula_of_brown_and_conrady():
 def test_the_fold_is_where_the_slope_seen_stops_rising():
     """The least eigenvalue of the derivative, from differences of the formula, over the disk and a ring around it."""
     rng = np.random.default_rng(6)
-    step, finite = 1e-5, 0
+    step = 1e-5
+    finite = 0
     for _ in range(60):
         lens = random_lens(rng)
         reach = min(lens.fold, 3.0)
         angles = np.linspace(0, 2 * np.pi, 90)[:, None]
         radii = np.concatenate([np.linspace(0.02, 0.9999, 30) * reach, [1.02 * reach]])
-        x, y = radii * np.cos(angles), radii * np.sin(angles)
+        x = radii * np.cos(angles)
+        y = radii * np.sin(angles)
         width = (1 / lens.aspect, 1.0)
         dx = (projected(lens, x + step, y) - projected(lens, x - step, y)) / (2 * step) * width
         dy = (projected(lens, x, y + step) - projected(lens, x, y - step)) / (2 * step) * width
@@ -106,7 +109,8 @@ def test_the_light_of_a_pixel_is_that_of_its_solid_angle():
         at = slopes_within(rng, 0.9 * min(widest(lens), 1.5), 20)[1:] * (lens.aspect, 1)
         shifts = np.array([[step, 0], [-step, 0], [0, step], [0, -step]])
         right, left, down, up = lens.traced(at[None] + shifts[:, None])
-        along, across = (right - left) / (2 * step), (down - up) / (2 * step)
+        along = (right - left) / (2 * step)
+        across = (down - up) / (2 * step)
         area = (along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]) * lens.aspect
         cosine = 1 / np.sqrt(1 + np.sum(lens.traced(at) ** 2, axis=-1))
         np.testing.assert_allclose(lens.illumination(at, natural=True), cosine**4 * area, rtol=2e-5)

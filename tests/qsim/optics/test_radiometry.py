@@ -82,7 +82,11 @@ def test_the_aperture_catches_what_arrives_on_the_image():
 
     For d >> f: power through the aperture = L S pi (f / 2N)^2 / d^2; irradiance = that / image area.
     """
-    radiance, area, distance, focal, number = 2.0, 1e-2, 1e3, 8e-3, 2.8
+    radiance = 2.0
+    area = 1e-2
+    distance = 1e3
+    focal = 8e-3
+    number = 2.8
     power = radiance * area * np.pi * (focal / (2 * number)) ** 2 / distance**2
     image = area * (focal / distance) ** 2
     camera = dataclasses.replace(PAPER, transmission=1.0, f_number=number)

@@ -75,14 +75,17 @@ def test_a_small_bright_spot_is_as_wide_as_the_circle_of_confusion(draws):
     rng = np.random.default_rng(11 + draws)
     for beyond in [False, True] * draws:
         camera, depth = focused(rng, beyond)
-        pupil, f, s = 2 * camera.pupil_radius, camera.focal_length, camera.focus
+        pupil = 2 * camera.pupil_radius
+        f = camera.focal_length
+        s = camera.focus
         circle = pupil * f * abs(depth - s) / (depth * (s - f)) / camera.pixel_pitch
         own = circle / 2
         place = (*(rng.uniform(-4, 4, 2) * depth / camera.focal_pixels).tolist(), -depth)
         made = glowing(own * depth / camera.focal_pixels, place, camera)
         picture = renderer(made, budget=Budget(2304, 1)).frame(0).radiance.astype(np.float64)
         centre, variance = moments(picture)
-        n, z = 2 * 2304 * own**2, critical_z(checks=8 * draws)
+        n = 2 * 2304 * own**2
+        z = critical_z(checks=8 * draws)
         np.testing.assert_allclose(centre, camera.project(np.array(place))[0], atol=z * np.sqrt(variance.max() / n))
         found = 4 * np.sqrt(variance.mean() - own**2 / 12 - 1 / 12)
         assert found == pytest.approx(circle, rel=z * variance.mean() * 8 / circle**2 / np.sqrt(2 * n))
@@ -140,7 +143,8 @@ def test_the_truth_of_a_static_scene_is_that_of_the_distorting_camera():
 
 def zooming() -> Camera:
     """Return a wide camera that turns, and whose lens changes from frame to frame."""
-    wide, far = Lens(-0.2, 0.05, (-0.2,), (0.02, 0.0)), Lens(0.1, 0.0, (-0.2,), (-0.03, 0.05), p1=0.02, aspect=1.1)
+    wide = Lens(-0.2, 0.05, (-0.2,), (0.02, 0.0))
+    far = Lens(0.1, 0.0, (-0.2,), (-0.03, 0.05), p1=0.02, aspect=1.1)
     zoom = Zoom((0.0, 2 / RATE, 5 / RATE), (0.9, 1.3, 1.1), (wide, far, replace(wide, k3=0.02)))
     return replace(CAMERA, focal_length=2e-3, lens=wide, zoom=zoom, motion=Spin((0, 1, 0.3), 30.0))
 
@@ -169,7 +173,8 @@ def test_rays_and_truth_follow_a_lens_that_changes():
 
 
 def test_a_spot_is_rendered_where_a_changing_lens_projects_it():
-    camera, t = zooming(), 2
+    camera = zooming()
+    t = 2
     pose = camera.pose(t / RATE)
     place = pose[:3, :3] @ camera.at(t / RATE).directions()[4, 28] * 2.5 + pose[:3, 3]
     made = renderer(glowing(0.08, tuple(place), camera), budget=Budget(1024, 1))

@@ -26,7 +26,8 @@ def test_the_best_mixture_is_known_without_the_truth(bias):
     truth = rng.random((200, 200))
     halves = truth + 0.5 * rng.standard_normal((2, 200, 200))
     mixed = mixture(halves, np.stack([truth + bias] * 2))
-    share, error = mixed.share, mixed.error
+    share = mixed.share
+    error = mixed.error
     best = 0.125 / (0.125 + bias**2)
     assert share.mean() == pytest.approx(best, abs=0.05)
     assert error**2 == pytest.approx(max(best * bias**2, 0.00125), abs=0.006)
@@ -41,7 +42,8 @@ def test_noise_that_the_filter_keeps_is_part_of_the_error():
     rng = np.random.default_rng(5)
     noise = rng.standard_normal((2, 400, 400))
     mixed = mixture(1 + noise, 1 + 0.6 * noise)
-    share, error = mixed.share, mixed.error
+    share = mixed.share
+    error = mixed.error
     assert share.mean() > 0.9
     assert error**2 == pytest.approx(0.36 / 2, rel=0.03)
 

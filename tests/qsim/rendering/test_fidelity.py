@@ -44,7 +44,8 @@ def test_more_light_on_the_sensor_needs_more_samples():
 
 def test_errors_that_repeat_in_all_frames_of_a_code_have_a_stricter_limit(monkeypatch):
     """A code of 16 frames averages their noise: bounces, and frames that are denoised or shared, may err a quarter."""
-    made, limits = plate(Spin((0, 0, 1), 200.0), light=SunSky()), []
+    made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
+    limits = []
 
     def denoised(*arguments):
         limits.append(arguments[3])

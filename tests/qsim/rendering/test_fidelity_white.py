@@ -90,7 +90,8 @@ def test_a_rendered_clip_states_its_error_below_its_own_white(tmp_path, capsys):
     """`--explain` prints the limit, the motion and the light left out."""
     command = ["render", "fan", "-o", str(tmp_path / "fan"), "--frames", "2", "--height", "24", "--width", "32"]
     assert main([*command, "--psnr", "20", "--explain"]) == 0
-    clip, text = Clip.open(tmp_path / "fan"), capsys.readouterr().out
+    clip = Clip.open(tmp_path / "fan")
+    text = capsys.readouterr().out
     radiance = np.stack([clip.radiance(t) for t in range(2)]).astype(np.float64)
     assert clip.meta["white"] == pytest.approx(white_in(radiance), rel=1e-3)
     assert clip.meta["render"]["white"] == pytest.approx(clip.meta["white"], rel=0.5)

@@ -51,7 +51,8 @@ def test_radiance_at_rest_is_the_steady_one_times_the_mean_strength(kind, shutte
     strength = made.strengths(5)["body1" if kind == "glow" else "light0"]
     assert np.ptp(strength) > 0.1
     for t in (3, 0):
-        seen, expected = made.frame(t, with_truth=False), other.frame(t, with_truth=False)
+        seen = made.frame(t, with_truth=False)
+        expected = other.frame(t, with_truth=False)
         np.testing.assert_allclose(seen.radiance, expected.radiance * strength[t], rtol=2e-6, atol=1e-9)
         assert seen.error == pytest.approx(expected.error * strength[t], rel=1e-4)
         if shutter > 0:
@@ -60,7 +61,8 @@ def test_radiance_at_rest_is_the_steady_one_times_the_mean_strength(kind, shutte
 
 def test_lights_of_different_flicker_add():
     """Frames in any order are sums of what each light adds, times its strength; crops see the same."""
-    first, second = Mains(100, 0.9, 1.0), RectifiedSine(120, 0.3)
+    first = Mains(100, 0.9, 1.0)
+    second = RectifiedSine(120, 0.3)
     lamps = [LIGHTS["lamp"](first), LIGHTS["point"](second)]
 
     def seen(lights, t, crop=None):

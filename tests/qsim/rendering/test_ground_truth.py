@@ -43,7 +43,8 @@ def test_a_spinning_plate_flows_along_chords():
     frame = renderer(plate(Spin((0, 0, 1), angle * RATE))).frame(0)
     on = frame.body_id == 1
     y, x = np.mgrid[:24, :33] + 0.5
-    right, up = x[on] - 16.5, 12 - y[on]
+    right = x[on] - 16.5
+    up = 12 - y[on]
     turned = np.cos(angle) * right - np.sin(angle) * up, np.sin(angle) * right + np.cos(angle) * up
     expected = np.stack([turned[0] - right, -(turned[1] - up)])
     assert np.abs(expected).max() > 0.5
@@ -60,14 +61,16 @@ def sampled(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def test_going_forward_and_back_returns_where_valid():
     camera = CAMERA.resized(48, 66)
     views = renderer(plate(Spin((0.2, 0.3, 1), 300.0), camera=camera))
-    first, second = views.frame(3), views.frame(4)
+    first = views.frame(3)
+    second = views.frame(4)
     y, x = np.mgrid[:48, :66] + 0.5
     # Away from outlines, where bilinear flow mixes two bodies.
     same = np.ones((48, 66), bool)
     ends = x + first.flow[0], y + first.flow[1]
     for dy in (-0.5, 0.5):
         for dx in (-0.5, 0.5):
-            row, column = np.floor(ends[1] + dy - 0.0), np.floor(ends[0] + dx - 0.0)
+            row = np.floor(ends[1] + dy - 0.0)
+            column = np.floor(ends[0] + dx - 0.0)
             inside = (row >= 0) & (row < 48) & (column >= 0) & (column < 66)
             seen = second.body_id[row.clip(0, 47).astype(int), column.clip(0, 65).astype(int)]
             same &= inside & (seen == first.body_id)
@@ -104,7 +107,8 @@ def test_colours_move_with_the_flow():
     smooth = Texture(0.5 + 0.3 * np.sin(np.linspace(0, 2 * np.pi, 64, endpoint=False))[None, :] * np.ones((64, 1)))
     made = scene(Body("plate", square(8), Diffuse(smooth), Translation((160.0, 60.0, 0))), camera=camera)
     views = renderer(made, budget=Budget(64, 1))
-    first, second = views.frame(0), views.frame(1)
+    first = views.frame(0)
+    second = views.frame(1)
     assert np.abs(first.flow).max() > 0.4
     y, x = np.mgrid[:60, :80] + 0.5
     difference = (sampled(second.radiance, x + first.flow[0], y + first.flow[1]) - first.radiance)[first.valid]
@@ -115,7 +119,8 @@ def test_colours_move_with_the_flow():
 
 def test_a_static_scene_is_static():
     views = renderer(plate(None))
-    first, second = views.frame(0), views.frame(5)
+    first = views.frame(0)
+    second = views.frame(5)
     for name in ("flow", "flow_back"):
         assert (first.truth[name] == 0).all()
     assert first.valid.all()
@@ -168,7 +173,8 @@ def test_the_flow_of_a_skinned_body_is_that_of_its_points(seed):
         return (shares[vertex] @ both)[:3] + np.multiply(t, (300.0, -200.0, 100.0))
 
     now, later = (np.array([place(v, t) for v in range(len(shares))]) for t in (2 / RATE, 3 / RATE))
-    on, seen = truth.body_id == 1, 0
+    on = truth.body_id == 1
+    seen = 0
     for y, x in np.argwhere(on)[::7]:
         ray = np.array([(x + 0.5 - 16.5), -(y + 0.5 - 12), -CAMERA.focal_pixels]) / CAMERA.focal_pixels
         matches = []

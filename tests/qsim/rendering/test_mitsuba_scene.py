@@ -155,7 +155,8 @@ def test_a_scene_is_updated_once_per_time(monkeypatch):
     """Light, surfaces and ground truth of a frame share its placement, also after an interruption."""
     one = renderer(plate(Spin((0, 0, 1), 20.0)), budget=CHEAP)
     parameters = type(one.mi.traverse(one.stage.loaded))
-    update, calls = parameters.update, []
+    update = parameters.update
+    calls = []
 
     def counted(self, *values):
         calls.append(1)

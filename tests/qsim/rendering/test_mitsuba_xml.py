@@ -43,7 +43,8 @@ def test_named_shapes_move_with_their_true_flow(room):
     motion = Translation(tuple(step * RATE))
     scene = read_mitsuba(room, {"ball": motion, "box": motion})
     views = Renderer(scene, frame_rate=RATE, budget=BUDGET)
-    first, second = views.frame(0), views.frame(1)
+    first = views.frame(0)
+    second = views.frame(1)
     assert [part.name for part in scene.parts] == ["ball", "box", "shape 2"]
     assert sorted(np.unique(first.body_id)) == [0, 1, 2]
     expected = scene.camera.focal_pixels * step[0] / first.depth  # a step along x does not change z
@@ -61,7 +62,8 @@ def test_a_spinning_mesh_turns_its_normals_too(room):
     """A box turned by a right angle about its own middle looks the same, in place and in light."""
     quarter = Spin((0, 1, 0), np.pi / 2 * RATE, center=(-0.7, 0.0, 0.0))
     views = Renderer(read_mitsuba(room, {"box": quarter}), frame_rate=RATE, budget=Budget(128, 3))
-    first, turned = views.frame(0), views.frame(1)
+    first = views.frame(0)
+    turned = views.frame(1)
     assert (first.body_id == turned.body_id).mean() > 0.99
     on = (first.body_id == 1) & (turned.body_id == 1)
     assert np.abs(first.radiance[on].mean() / turned.radiance[on].mean() - 1) < 0.02

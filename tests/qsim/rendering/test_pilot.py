@@ -56,7 +56,8 @@ def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
 def test_a_denoised_trial_with_far_less_noise_than_the_pilots_is_rejected():
     """Its windows missed the rare bright paths that the pilots found."""
     made = plate(None, light=SunSky(), camera=replace(CAMERA, height=48, width=64))
-    loaded, allowed = pilot.Pilot.of(made, 2000.0, 0.0, 1, 0), Allowed(white=10.0, target=0.02)
+    loaded = pilot.Pilot.of(made, 2000.0, 0.0, 1, 0)
+    allowed = Allowed(white=10.0, target=0.02)
     lucky, plain = (
         pilot.denoised_samples(loaded, 1, 2, allowed, 1.0, 5000, None, lambda n, noise=noise: Errors(noise, noise))[0]
         for noise in (100.0, 0.0)

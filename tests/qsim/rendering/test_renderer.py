@@ -101,7 +101,8 @@ def test_scalar_and_vector_engines_agree(light):
     fast = renderer(made, budget=Budget(512, 2))
     slow = renderer(made, budget=Budget(512, 2), engine=choose("scalar"))
     try:
-        ours, theirs = fast.frame(1), slow.frame(1)
+        ours = fast.frame(1)
+        theirs = slow.frame(1)
     finally:
         select()
     limit = critical_z(checks=35) * math.hypot(ours.error, theirs.error) * 2
@@ -241,7 +242,8 @@ def test_a_pilot_and_a_flickering_exposure_tolerate_samples_that_are_not_numbers
         return found
 
     monkeypatch.setattr(Renderer, "_pass", broken)
-    flight, light = Translation((600.0, 0.0, 0.0)), Constant(0.7, PulseWidth(3000, 0.2))
+    flight = Translation((600.0, 0.0, 0.0))
+    light = Constant(0.7, PulseWidth(3000, 0.2))
     frame = renderer(plate(flight, light), Budget(72, 2, 9), shutter=1.0).frame(0, with_truth=False)
     assert math.isfinite(frame.error)
     assert frame.error < frame.radiance.mean()
@@ -253,7 +255,8 @@ def test_a_pilot_and_a_flickering_exposure_tolerate_samples_that_are_not_numbers
 
 
 def test_a_crop_shows_its_window_of_the_frame(spinning):
-    made, whole = spinning.scene, spinning.frame(1)
+    made = spinning.scene
+    whole = spinning.frame(1)
     part = renderer(made, crop=(3, 5, 9, 14)).frame(1)
     assert part.radiance.shape == (9, 14)
     for name in ("flow", "valid", "depth", "body_id"):

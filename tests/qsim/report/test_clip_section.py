@@ -153,12 +153,14 @@ def test_numbers_of_the_first_frames_are_not_those_of_the_clip(tmp_path):
     with ClipWriter(tmp_path / "late", meta) as writer:
         for t in range(60):
             left = 2 + max(t - 50, 0)
-            radiance, flow = np.full(size, 0.1, np.float32), np.zeros((2, *size), np.float32)
+            radiance = np.full(size, 0.1, np.float32)
+            flow = np.zeros((2, *size), np.float32)
             radiance[2:6, left : left + 4] = 1.0
             flow[0, 2:6, left : left + 4] = t >= 50
             writer.add(t, radiance, truth={"flow": flow, "flow_back": -flow, "valid": np.ones(size, bool)})
     stream = Clip.open(tmp_path / "late").sense(bits=3, ppp=3.25, name="mine")
-    body, which = clip_section.clip_section(Clip.open(tmp_path / "late")).body, "in the first 48 of 60"
+    body = clip_section.clip_section(Clip.open(tmp_path / "late")).body
+    which = "in the first 48 of 60"
     assert f"Motion {which} frames: nothing moves" in body
     assert body.count("nothing moves") == 1
     assert f"motion between successive frames, all pixels {which} frames" in body

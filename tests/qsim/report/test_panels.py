@@ -28,7 +28,8 @@ def stream(tmp_path_factory):
 
 def test_codes_are_on_the_tone_curve_of_the_truth(stream):
     """A code is drawn as the light at which it is the mean code: codes of few photons are not nearly black."""
-    clip, frames = Clip.open(stream.path.parents[1]), range(5)
+    clip = Clip.open(stream.path.parents[1])
+    frames = range(5)
     truth = panels.truth_photons(clip, stream, frames)
     shown = panels.stream_panels(stream, frames, truth)[0].frames
     codes = stream.codes(0, 5)
@@ -107,7 +108,8 @@ def test_errors_are_red_above_and_blue_below():
 
 def test_ground_truth_lies_over_the_light(tmp_path):
     """Flow, depth, bodies and hidden points of a clip; what is even everywhere has no picture."""
-    size, rng = (8, 11), np.random.default_rng(1)
+    size = (8, 11)
+    rng = np.random.default_rng(1)
     flow = np.zeros((2, *size), np.float32)
     flow[0, :, 5:] = 3.0
     depth = np.repeat(np.linspace(1, 4, 8, dtype=np.float32)[:, None], 11, axis=1)
@@ -130,7 +132,8 @@ def test_ground_truth_lies_over_the_light(tmp_path):
     assert largest == pytest.approx(3.0)
     assert speed.max() == pytest.approx(3.0)
     light, motion, near, bodies, hidden = (panel.frames[0].astype(int) for panel in found)
-    still, moving = (4, 1), (4, 8)
+    still = (4, 1)
+    moving = (4, 8)
     assert np.ptp(motion[still]) == 0, "grey where nothing moves"
     assert motion[moving][0] - motion[moving][1] > 50, "red to the right"
     assert near[0].sum() > near[-1].sum(), "near is bright"
@@ -138,7 +141,8 @@ def test_ground_truth_lies_over_the_light(tmp_path):
     assert np.ptp(bodies[moving]) > 40
     assert hidden[2, 3, 0] - hidden[2, 3, 1] > 50
     assert np.ptp(hidden[still]) == 0
-    dark, bright = np.unravel_index(light.argmin(), size), np.unravel_index(light.argmax(), size)
+    dark = np.unravel_index(light.argmin(), size)
+    bright = np.unravel_index(light.argmax(), size)
     assert motion[bright].max() > motion[dark].max()
 
 

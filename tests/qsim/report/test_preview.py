@@ -199,7 +199,8 @@ def test_mistakes_are_one_line(clip, tmp_path, monkeypatch, capsys, words, messa
 
 
 def test_neither_the_picture_nor_its_json_is_replaced_without_force(clip, tmp_path, capsys):
-    target, beside = tmp_path / "a.png", tmp_path / "a.png.json"
+    target = tmp_path / "a.png"
+    beside = tmp_path / "a.png.json"
     beside.write_text("mine")
     assert main(["preview", str(clip.path), "-o", str(target), "--what", "sharp"]) == 2
     assert "a.png.json: exists; name another with -o, or use --force" in capsys.readouterr().err

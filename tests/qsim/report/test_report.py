@@ -63,7 +63,8 @@ def test_ground_truth_lies_over_restored_video(tmp_path):
 
 
 def test_several_paths_are_one_page_without_repetition(folder, tmp_path, capsys, monkeypatch):
-    clip, video = folder / "square", folder / "video.npy"
+    clip = folder / "square"
+    video = folder / "video.npy"
     assert report.build_page(clip, video, clip).count("<h2>") == 2
     assert report.build_page(folder, clip).count("<h2>") == report.build_page(folder).count("<h2>")
     with pytest.raises(ValueError, match="empty: nothing to report"):

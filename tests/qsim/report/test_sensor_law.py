@@ -40,7 +40,9 @@ def random_sensor(model: str, rng: np.random.Generator) -> tuple[dict, Sensor]:
 
 
 def ours(record: dict) -> Sensor:
-    efficiency, dark, bits = record["efficiency"], record["dark"], record["bits"]
+    efficiency = record["efficiency"]
+    dark = record["dark"]
+    bits = record["bits"]
     if record["model"] == "QIS":
         return QIS(efficiency, dark, record["noise"], bits, gain=record["gain"])
     if record["model"] == "BinarySPAD":
@@ -119,7 +121,8 @@ def test_mean_deviation_and_snr_are_those_of_the_exact_channel(law, model):
         exposure = record["exposure"]
         light = light_levels(record, rng, 8)[1:]
         found = law.value("responseAt(s, light)", s=record, light=light.tolist())
-        mean, variance = sensor.mean(light, exposure), sensor.variance(light, exposure)
+        mean = sensor.mean(light, exposure)
+        variance = sensor.variance(light, exposure)
         np.testing.assert_allclose([f["mean"] for f in found], mean, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose([f["deviation"] for f in found], np.sqrt(variance), rtol=1e-5, atol=1e-5)
         slope = -sensor.dcdf(light, exposure).sum(axis=-1)  # of the mean code

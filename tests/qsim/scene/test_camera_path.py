@@ -56,7 +56,9 @@ def test_a_path_comes_back_to_a_billionth(tmp_path: Path):
     """Poses, view and lens of random cameras, at any angle between two poses up to half a turn."""
     rng = np.random.default_rng(0)
     for i in range(30):
-        camera, file, again = random_camera(rng), tmp_path / f"{i}.json", tmp_path / f"{i}_again.json"
+        camera = random_camera(rng)
+        file = tmp_path / f"{i}.json"
+        again = tmp_path / f"{i}_again.json"
         write_camera_path(file, camera, frames=7, frame_rate=700.0)
         found = read_camera_path(file, camera)
         for t in range(7):
@@ -87,7 +89,8 @@ def test_the_world_of_a_file_has_z_up_and_its_cameras_look_back(tmp_path: Path):
 def test_between_poses_it_moves_smoothly_and_turns_evenly(tmp_path: Path):
     frames = []
     for i, angle in enumerate((0.0, 0.6, 1.2)):
-        c, s = math.cos(angle), math.sin(angle)
+        c = math.cos(angle)
+        s = math.sin(angle)
         frames.append({"transform_matrix": [[c, -s, 0, 3.0 * i], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]})
     camera = read_camera_path(written(tmp_path / "p.json", frames=frames), scale=0.5)
     for share in (0.25, 0.5, 1.75):
@@ -240,7 +243,8 @@ def test_mutated_files_are_refused_in_one_line_or_give_finite_poses(tmp_path: Pa
     content = json.loads(whole.read_text())
     places = [(key,) for key in content] + [("frames", 0), ("frames", 1, "file_path"), ("frames", 1, "fl_x")]
     places += [("frames", 2, "transform_matrix", *more) for more in ((), (0,), (1, 2), (3, 3))]
-    path, read = tmp_path / "q.json", 0
+    path = tmp_path / "q.json"
+    read = 0
     texts = [whole.read_text()[:cut] for cut in range(0, len(whole.read_text()), 37)] + [
         "[]",
         "null",

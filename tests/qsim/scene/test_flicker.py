@@ -14,7 +14,8 @@ POINTS = 20_011  # moments of a sum
 
 def drawn(rng: np.random.Generator):
     """A flicker of any kind, over the whole range of its parameters."""
-    frequency, phase = 10 ** rng.uniform(-1, 5), rng.uniform(-20, 20)
+    frequency = 10 ** rng.uniform(-1, 5)
+    phase = rng.uniform(-20, 20)
     kind = rng.integers(3)
     if kind == 0:
         return Mains(frequency, rng.choice([0.0, 1.0, rng.random()]), phase)
@@ -40,7 +41,8 @@ def test_the_closed_form_is_the_mean_of_the_definition():
     rng = np.random.default_rng(1)
     for _ in range(300):
         flicker = drawn(rng)
-        start, length = rng.uniform(-3, 3) / flicker.frequency, 10 ** rng.uniform(-3, 1.5) / flicker.frequency
+        start = rng.uniform(-3, 3) / flicker.frequency
+        length = 10 ** rng.uniform(-3, 1.5) / flicker.frequency
         moments = start + (np.arange(POINTS) + 0.5) / POINTS * length
         turns = length * flicker.frequency
         jumps = 2 * (turns + 1) / flicker.duty if isinstance(flicker, PulseWidth) else 12 * (turns + 1) ** 2 / POINTS

@@ -35,7 +35,8 @@ def test_grey_pictures_of_16_bits_are_read_in_full(tmp_path):
     rng = np.random.default_rng(0)
     codes = rng.integers(0, 256, (5, 7)).astype(np.uint8)
     Image.fromarray(codes).save(tmp_path / "8.png")
-    expected, wide = Texture(str(tmp_path / "8.png")), codes.astype(np.uint16) * 257
+    expected = Texture(str(tmp_path / "8.png"))
+    wide = codes.astype(np.uint16) * 257
     Image.fromarray(wide).save(tmp_path / "16.png")
     Image.fromarray(wide).save(tmp_path / "16.tif")
     tifffile.imwrite(tmp_path / "big.tif", wide, byteorder=">")
@@ -128,7 +129,8 @@ def test_parts_of_an_exr_are_looked_through(tmp_path: Path):
     def part(name: str, channels: dict) -> OpenEXR.Part:
         return OpenEXR.Part(dict(header), channels, name)
 
-    depth, picture = {"Z": colours[..., 0].copy()}, {"RGB": colours}
+    depth = {"Z": colours[..., 0].copy()}
+    picture = {"RGB": colours}
     OpenEXR.File([part("depth", depth), part("beauty", picture)]).write(str(tmp_path / "a.exr"))
     np.testing.assert_array_equal(read_hdr(tmp_path / "a.exr"), colours)
     OpenEXR.File([part("left", picture), part("right", picture)]).write(str(tmp_path / "b.exr"))

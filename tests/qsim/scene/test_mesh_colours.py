@@ -102,11 +102,14 @@ def looked_up(
         widths = [(0, 0)] * 3
         widths[axis] = (pad * picture.shape[axis],) * 2
         padded = np.pad(padded, widths, mode=mode)
-    x, y = (u + pad) * width - 0.5, (v + pad) * height - 0.5
+    x = (u + pad) * width - 0.5
+    y = (v + pad) * height - 0.5
     if nearest:
         return padded[np.rint(y).astype(int), np.rint(x).astype(int)]
-    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
-    a, b = (x - left)[..., None], (y - top)[..., None]
+    left = np.floor(x).astype(int)
+    top = np.floor(y).astype(int)
+    a = (x - left)[..., None]
+    b = (y - top)[..., None]
     upper = padded[top, left] * (1 - a) + padded[top, left + 1] * a
     lower = padded[top + 1, left] * (1 - a) + padded[top + 1, left + 1] * a
     return upper * (1 - b) + lower * b
@@ -253,7 +256,8 @@ def write_obj(folder: Path, obj: str = OBJ, mtl: str = MTL) -> Path:
 
 def test_a_file_of_two_materials_is_one_body_of_patches(tmp_path):
     path = write_obj(tmp_path)
-    mesh, material = mesh_file(path), mesh_material(path)
+    mesh = mesh_file(path)
+    material = mesh_material(path)
     assert isinstance(material, Patches)
     assert material.counts == (1, 1)
     np.testing.assert_allclose(mesh.uv[mesh.faces[0]], [(0.5, 0), (2.5, 0), (2.5, 3)])

@@ -63,7 +63,8 @@ STEP = 1e-6  # s: central differences err by step^2 * third derivative, below 1e
 def test_velocity_is_the_derivative_of_the_pose(name, t):
     motion = MOTIONS[name]
     linear, angular = motion.velocity(t)
-    before, after = motion.pose(t - STEP), motion.pose(t + STEP)
+    before = motion.pose(t - STEP)
+    after = motion.pose(t + STEP)
     np.testing.assert_allclose(linear, (after - before)[:3, 3] / (2 * STEP), atol=2e-6 * (1 + np.abs(linear).max()))
     turned = logarithm(after[:3, :3] @ before[:3, :3].T) / (2 * STEP)
     np.testing.assert_allclose(angular, turned, atol=2e-6 * (1 + np.abs(angular).max()))
@@ -71,7 +72,8 @@ def test_velocity_is_the_derivative_of_the_pose(name, t):
 
 @pytest.mark.parametrize("name", MOTIONS)
 def test_every_pose_is_rigid_and_its_points_move_as_stated(name):
-    motion, points = MOTIONS[name], np.random.default_rng(1).normal(size=(5, 3))
+    motion = MOTIONS[name]
+    points = np.random.default_rng(1).normal(size=(5, 3))
     for t in (0.0301, 0.2201):
         pose = motion.pose(t)
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
@@ -110,7 +112,10 @@ def test_closed_forms():
 
 
 def test_composition_multiplies_poses_and_is_associative():
-    t, a, b, c = 0.17, FLYING, TURNING, SHAKING
+    t = 0.17
+    a = FLYING
+    b = TURNING
+    c = SHAKING
     np.testing.assert_allclose((a @ b).pose(t), a.pose(t) @ b.pose(t))
     np.testing.assert_allclose(((a @ b) @ c).pose(t), (a @ (b @ c)).pose(t))
     for left, right in zip(((a @ b) @ c).velocity(t), (a @ (b @ c)).velocity(t), strict=True):
@@ -139,7 +144,8 @@ def test_keyframes_pass_their_keys_and_rest_outside():
 
 def test_keyframes_rotate_uniformly_and_their_paths_have_no_kink():
     for key in KEYS.times[1:-1]:
-        before, after = KEYS.velocity(key - 1e-9)[0], KEYS.velocity(key + 1e-9)[0]
+        before = KEYS.velocity(key - 1e-9)[0]
+        after = KEYS.velocity(key + 1e-9)[0]
         np.testing.assert_allclose(before, after, atol=1e-6)
     np.testing.assert_allclose(KEYS.velocity(0.31)[1], KEYS.velocity(0.49)[1])
 

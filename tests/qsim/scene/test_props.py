@@ -10,13 +10,15 @@ from qsim.scene.props import gear, glyph_outlines, letters, rotor
 
 
 def test_gears_have_their_teeth_bore_and_size():
-    plain, spoked = gear(12, 0.1, 0.02), gear(12, 0.1, 0.02, spokes=4)
+    plain = gear(12, 0.1, 0.02)
+    spoked = gear(12, 0.1, 0.02, spokes=4)
     reach = np.hypot(*plain.vertices[:, :2].T)
     assert reach.max() == pytest.approx(0.1)
     assert 0.014 * np.cos(np.pi / 24) <= reach.min() * (1 + 1e-12) <= 0.014 * (1 + 2e-12)  # the bore has 24 corners
     angle = np.arctan2(plain.vertices[:, 1], plain.vertices[:, 0])[reach > 0.0999]
     assert len(np.unique(np.round(angle * 12 / (2 * np.pi)) % 12)) == 12
-    root, tip = 0.1 * 0.82, 0.1
+    root = 0.1 * 0.82
+    tip = 0.1
     rim = 12 * (tip**2 * np.sin(0.32 * 2 * np.pi / 12) + root**2 * np.sin(0.40 * 2 * np.pi / 12)) / 2
     flanks = 12 * root * tip * np.sin(0.14 * 2 * np.pi / 12)
     bore = np.pi * 0.014**2 * polygon_share(24)
@@ -27,7 +29,8 @@ def test_gears_have_their_teeth_bore_and_size():
 
 
 def test_rotors_have_equal_blades_within_their_radius():
-    one, five = rotor(1, 0.3), rotor(5, 0.3)
+    one = rotor(1, 0.3)
+    five = rotor(5, 0.3)
     assert len(five.faces) == 5 * len(one.faces)
     assert area(five) == pytest.approx(5 * area(one))
     assert 0.28 < np.hypot(*five.vertices[:, :2].T).max() < 0.34

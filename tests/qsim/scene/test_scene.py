@@ -33,7 +33,8 @@ MAPPED = Mesh(TRIANGLE.vertices, TRIANGLE.faces, np.eye(3)[:, :2])
 CAMERA = Camera(focal_length=8e-3, f_number=2.8, pixel_pitch=1e-5, height=7, width=10)
 
 
-LIGHT, BODY = Constant(1.0), Body("a", TRIANGLE)
+LIGHT = Constant(1.0)
+BODY = Body("a", TRIANGLE)
 
 
 def scene(lights=(LIGHT,), bodies=(BODY,)) -> Scene:

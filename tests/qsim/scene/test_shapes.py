@@ -131,7 +131,8 @@ def test_sizes_are_the_requested_ones():
 
 
 def test_moved_keeps_faces_outward_even_in_a_mirror():
-    solid, mirror = box(1, 2, 3), np.diag([-1.0, 2, 1, 1])
+    solid = box(1, 2, 3)
+    mirror = np.diag([-1.0, 2, 1, 1])
     assert volume(moved(solid, mirror)) == pytest.approx(2 * volume(solid))
 
 
@@ -146,7 +147,8 @@ def test_filled_follows_the_even_odd_rule_with_holes_and_islands():
     loops = [SQUARE, 0.5 * SQUARE[::-1], 0.25 * SQUARE]  # hole drawn backwards: direction does not matter
     points, triangles = filled(loops)
     corner = points[triangles]
-    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    a = corner[:, 1] - corner[:, 0]
+    b = corner[:, 2] - corner[:, 0]
     signed = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
     assert (signed >= -1e-15).all()  # counter-clockwise
     assert signed.sum() == pytest.approx(4 - 1 + 0.25)
@@ -156,7 +158,8 @@ def test_filled_follows_the_even_odd_rule_with_holes_and_islands():
 
 @pytest.mark.parametrize("path", [CIRCLE, KNOT], ids=["circle", "knot"])
 def test_a_closed_wire_is_as_thick_at_its_seam_as_elsewhere(path):
-    radius, sides = 0.05, 8
+    radius = 0.05
+    sides = 8
     rings = wire(path, radius, sides, closed=True).vertices.reshape(len(path) + 1, sides + 1, 3)
     middles = np.vstack([path, path[:1]])
     np.testing.assert_allclose(np.linalg.norm(rings - middles[:, None], axis=2), radius, rtol=1e-9)

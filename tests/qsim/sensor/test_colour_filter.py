@@ -35,7 +35,8 @@ def test_every_pixel_collects_what_its_colour_passes():
             continue
         done += 1
         height, width, y0, x0 = (int(n) for n in rng.integers(1, 12, 4))
-        photons, own = rng.uniform(0, 30, (2, 3, height, width)), float(rng.uniform(0.1, 1))
+        photons = rng.uniform(0, 30, (2, 3, height, width))
+        own = float(rng.uniform(0.1, 1))
         found = filters.mosaic(photons, own, (y0, x0))
         for y, x in np.ndindex(height, width):
             colour = filters.mask[(y + y0) % len(filters.mask)][(x + x0) % len(filters.mask[0])]
@@ -81,14 +82,17 @@ def test_an_ideal_counter_counts_poisson_photons_of_each_colour():
 
 def test_engines_agree_on_mosaics():
     """Over random masks, sensors and light, at odd sizes and origins: the compiled codes are the reference's."""
-    rng, differ, total = np.random.default_rng(2), 0, 0
+    rng = np.random.default_rng(2)
+    differ = 0
+    total = 0
     for trial in range(6):
         filters = ColourFilter(MASKS[TILES[trial % 3]], None if trial % 2 else CROSSED_OF[trial % 3])
         sensor = (QIS(0.7, 5.0, float(rng.uniform(0, 0.5)), 3), BinarySPAD(0.4, 100.0))[trial % 2]
         photons = rng.gamma(1.0, float(rng.uniform(0.2, 6)), (2, 3, 131, 77)).astype(np.float32)
         light = filters.mosaic(photons, sensor.efficiency, (3, 5))
         one, two = (sensor.sample(light, EXPOSURE, key=Key(trial, 9), engine=e) for e in ("reference", "fast"))
-        differ, total = differ + int((one != two).sum()), total + one.size
+        differ = differ + int((one != two).sum())
+        total = total + one.size
     assert differ <= 5e-6 * total
 
 

@@ -58,7 +58,8 @@ def paralyzable_errors(shares, all_arrivals, bits: int, digits: int = 400) -> np
     worst = np.zeros(3)
     with mp.workdps(digits):
         for share, arrivals in product(shares, all_arrivals):
-            sensor, step = CountingSPAD(1.0, 0.0, share, bits, True), mp.mpf(arrivals) * mp.mpf(10) ** (-digits // 8)
+            sensor = CountingSPAD(1.0, 0.0, share, bits, True)
+            step = mp.mpf(arrivals) * mp.mpf(10) ** (-digits // 8)
             pmf = paralyzable_oracle(arrivals, share)
             beside = [paralyzable_oracle(mp.mpf(arrivals) + s, share) for s in (step, -step)]
             change = [(x - y) / (2 * step) for x, y in zip(*beside, strict=True)]
@@ -192,9 +193,13 @@ def test_the_error_of_deep_counters_is_below_1e_11(k, live):
     with mp.workdps(40):
         mean = mp.mpf(live)
         term = mp.exp(k * mp.log(mean) - mean - mp.loggamma(k + 1))
-        total, n = mp.mpf(0), k
+        total = mp.mpf(0)
+        n = k
         while n >= 0 and term > 1e-25:
-            total, term, n = total + term, term * n / mean, n - 1
-        below, above = float(total), float(1 - total)
+            total = total + term
+            term = term * n / mean
+            n = n - 1
+        below = float(total)
+        above = float(1 - total)
     assert abs(gammaincc(k + 1, live) - below) < 1e-11
     assert abs(gammainc(k + 1, live) - above) < 1e-11

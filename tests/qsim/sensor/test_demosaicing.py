@@ -36,7 +36,8 @@ def decibels(one: np.ndarray, other: np.ndarray) -> float:
 
 def test_flat_colours_come_back_from_every_mask():
     """Over random masks with three bands or more, efficiencies, sizes that the tile does not divide, and colours."""
-    rng, done = np.random.default_rng(0), 0
+    rng = np.random.default_rng(0)
+    done = 0
     while done < 25:
         rows, columns = (int(n) for n in rng.integers(1, 5, 2))
         mask = tuple("".join("RGBW"[i] for i in row) for row in rng.integers(0, 4, (rows, columns)))
@@ -44,7 +45,8 @@ def test_flat_colours_come_back_from_every_mask():
         if np.linalg.matrix_rank(filters.weights(0.8).reshape(3, -1)) < 3:
             continue
         done += 1
-        height, width = rows + int(rng.integers(0, 9)), columns + int(rng.integers(0, 9))
+        height = rows + int(rng.integers(0, 9))
+        width = columns + int(rng.integers(0, 9))
         flat = np.broadcast_to(rng.uniform(0.5, 20, (3, 1, 1)), (3, height, width))
         np.testing.assert_allclose(demosaic(filters.mosaic(flat, 0.8), filters, 0.8), flat, rtol=2e-3)
 
@@ -68,7 +70,8 @@ def test_mixed_colours_are_separated(name, crossed):
 
 
 def test_frames_of_a_stack_are_restored_alone():
-    filters, stack = ColourFilter(MASKS["quad"]), np.random.default_rng(1).uniform(0, 9, (2, 3, 9, 11))
+    filters = ColourFilter(MASKS["quad"])
+    stack = np.random.default_rng(1).uniform(0, 9, (2, 3, 9, 11))
     both = demosaic(filters.mosaic(stack, 1.0), filters, 1.0)
     for t in range(2):
         np.testing.assert_allclose(both[t], demosaic(filters.mosaic(stack[t], 1.0), filters, 1.0), rtol=1e-12)

@@ -49,7 +49,9 @@ def test_profiles_give_the_flat_fields_of_the_specification(profile, ppp, gain, 
 
 
 def test_the_profiles_differ_only_in_dark_current_and_gain():
-    published, physical, paper = quiver_published(9.75), quiver_physical(9.75), quiver_paper()
+    published = quiver_published(9.75)
+    physical = quiver_physical(9.75)
+    paper = quiver_paper()
     assert published.dark_current == pytest.approx(3200)
     assert replace(published, dark_current=1.6) == physical
     assert replace(physical, gain=1.0) == paper
@@ -65,7 +67,8 @@ def test_published_dark_electrons_are_per_frame_at_any_exposure():
 def test_the_gain_rule_puts_the_light_level_on_half_of_the_range_and_never_above_one_code_per_electron(bits):
     """`white` is 2 PPP / QE at every depth, but at least the range itself, (2^b - 1) / QE."""
     for ppp in np.random.default_rng(bits).uniform(0.05, 200, 50):
-        published, physical = quiver_published(ppp, bits), quiver_physical(ppp, bits)
+        published = quiver_published(ppp, bits)
+        physical = quiver_physical(ppp, bits)
         assert published.gain == pytest.approx(0.5 * (2**bits - 1) / ppp)
         assert physical.gain == min(published.gain, 1.0)
         assert physical.white(EXPOSURE) == pytest.approx(max(2 * ppp, 2**bits - 1) / 0.8)
@@ -74,7 +77,8 @@ def test_the_gain_rule_puts_the_light_level_on_half_of_the_range_and_never_above
 def test_a_little_light_uses_more_than_two_codes():
     """At 0.5 PPP and 3 bits, one electron has code 1; with seven codes per electron it has code 7, as two have."""
     sensor = replace(quiver_physical(0.5), read_noise=0.0)
-    law, wasteful = sensor.pmf(1.25, EXPOSURE), replace(sensor, gain=7.0).pmf(1.25, EXPOSURE)
+    law = sensor.pmf(1.25, EXPOSURE)
+    wasteful = replace(sensor, gain=7.0).pmf(1.25, EXPOSURE)
     assert sensor.gain == 1.0
     np.testing.assert_allclose(law[1:3] / law[0], [1.0, 0.5], rtol=0.01)
     assert wasteful[1:7].sum() < 1e-9

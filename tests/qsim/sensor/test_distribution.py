@@ -16,7 +16,8 @@ from qsim.sensor.spad import BinarySPAD
 def test_the_three_descriptions_agree(sensor: Sensor):
     """cdf = sum of exp(log_pmf); dcdf = its derivative, by differences of 4th order with an error near 1e-10."""
     light = np.array([0.02, 0.7, 3.25, 9.75, 40.0])
-    cdf, pmf = sensor.cdf(light, EXPOSURE), np.exp(sensor.log_pmf(light, EXPOSURE))
+    cdf = sensor.cdf(light, EXPOSURE)
+    pmf = np.exp(sensor.log_pmf(light, EXPOSURE))
     np.testing.assert_allclose(np.cumsum(pmf, axis=-1), cdf, atol=1e-12)
     np.testing.assert_array_equal(cdf[:, -1], 1.0)
     h = 1e-3
@@ -87,7 +88,8 @@ def test_mean_code_of_the_published_profile():
 
 
 def test_log_likelihood_picks_the_code_and_broadcasts():
-    sensor, light = SENSORS[0], np.array([[1.0, 5.0, 9.0], [0.0, 2.0, 3.0]])
+    sensor = SENSORS[0]
+    light = np.array([[1.0, 5.0, 9.0], [0.0, 2.0, 3.0]])
     codes = np.array([[[0, 7, 3], [1, 2, 6]], [[5, 0, 0], [7, 1, 4]]], np.uint8)
     found = sensor.log_likelihood(codes, light, EXPOSURE)
     assert found.shape == (2, 2, 3)
@@ -116,7 +118,8 @@ def test_tails_are_drawn_to_two_to_the_minus_64():
         v = round(survival[k] * 2.0**64)  # 1 - u in units of 2^-64
         for offset, code in ((-max(1, v // 100), k), (max(1, v // 100), k - 1)):
             place = 2**64 - 1 - max(v + offset, 0)
-            first, second = np.array([place >> 32], np.uint32), np.array([place & 0xFFFFFFFF], np.uint32)
+            first = np.array([place >> 32], np.uint32)
+            second = np.array([place & 0xFFFFFFFF], np.uint32)
             assert sensor.codes_at(first, second, np.array([0.01]), EXPOSURE)[0] == code
     lowest = np.zeros(1, np.uint32)
     assert sensor.codes_at(lowest, lowest, np.array([30.0]), EXPOSURE)[0] == 0

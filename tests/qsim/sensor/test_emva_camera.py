@@ -12,9 +12,15 @@ from qsim.sensor.qis import QIS
 emva1288 = pytest.importorskip("emva1288.camera.camera")
 
 WAVELENGTH = np.array([550.0])  # nm
-PITCH, EXPOSURE, F_NUMBER, EFFICIENCY, READ_NOISE = 5.0, 1e-3, 8, 0.6, 2.0  # um, s, -, -, e-
+# um, s, -, -, e-
+PITCH = 5.0
+EXPOSURE = 1e-3
+F_NUMBER = 8
+EFFICIENCY = 0.6
+READ_NOISE = 2.0
 OFFSET = 20.0  # e-; the simulator cuts electrons at 0
-FRAMES, SIDE = 16, 256
+FRAMES = 16
+SIDE = 256
 
 
 @pytest.mark.parametrize("wanted_gain", [1.0, 0.5])

@@ -18,7 +18,9 @@ from qsim.sensor.spad import BinarySPAD
 @pytest.mark.parametrize("sensor", [SENSORS[0], SENSORS[4], SENSORS[6], SENSORS[7]])
 def test_estimates_scatter_as_fisher_information_says(sensor: Sensor):
     """From 2000 codes each: z-scores have mean 0 (bias of the order 1/sqrt(n)) and variance 1; intervals hold 95 %."""
-    n, repeats, light = 2000, 2000, 4.0
+    n = 2000
+    repeats = 2000
+    light = 4.0
     histograms = np.random.default_rng(5).multinomial(n, sensor.pmf(light, EXPOSURE), size=repeats)
     found = sensor.maximum_likelihood(histograms, EXPOSURE)
     z = (found.photons - light) * np.sqrt(n * sensor.fisher_information(light, EXPOSURE))
@@ -98,8 +100,10 @@ def test_the_codes_that_occur_give_the_estimates_of_all_codes(seed):
     """Estimates of many codes look only at those that occur; for few codes both ways can be compared."""
     rng = np.random.default_rng(seed)
     for _ in range(6):
-        bits, gain = int(rng.integers(2, 8)), 10 ** rng.uniform(-1, 1)
-        noise, offset = float(rng.choice([0.0, 0.2, 3.0])), float(rng.choice([0.0, 3.3]))
+        bits = int(rng.integers(2, 8))
+        gain = 10 ** rng.uniform(-1, 1)
+        noise = float(rng.choice([0.0, 0.2, 3.0]))
+        offset = float(rng.choice([0.0, 3.3]))
         well = None if rng.random() < 0.6 else float(rng.uniform(0.3, 1.5) * 2**bits / gain)
         dead = float(rng.choice([0.0, 1e-6, 3e-5]))
         sensors = (

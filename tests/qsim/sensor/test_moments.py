@@ -64,10 +64,12 @@ def test_steps_of_many_electrons(sensor: QIS):
         n = np.arange(np.floor(light - 12 * np.sqrt(light)), light + 12 * np.sqrt(light))
         chance = np.exp(poisson_log_pmf(np.array(light), n))
         x = sensor.gain * n + sensor.offset
-        codes, spread = np.rint(x), np.zeros(len(n))
+        codes = np.rint(x)
+        spread = np.zeros(len(n))
         if sensor.read_noise:
             up = ndtr((x - np.floor(x) - 0.5) / (sensor.gain * sensor.read_noise))
-            codes, spread = np.floor(x) + up, up * (1 - up)
+            codes = np.floor(x) + up
+            spread = up * (1 - up)
         mean = chance @ codes
         expected = np.array([mean]), np.array([chance @ (spread + (codes - mean) ** 2)])
         assert_equal_moments(sensor, qis_moments.moments(sensor, np.array([light])), expected)

@@ -63,7 +63,8 @@ def test_one_bit_is_numpy_packbits(width):
 def test_packing_does_not_change_its_input_or_alias_it():
     for bits in (1, 3, 8, 16):
         codes = draw((2, 9), bits)
-        before, packed = codes.copy(), pack(codes, bits)
+        before = codes.copy()
+        packed = pack(codes, bits)
         packed[...] = 255
         np.testing.assert_array_equal(codes, before)
 

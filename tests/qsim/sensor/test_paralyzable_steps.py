@@ -90,7 +90,8 @@ def test_all_light_up_to_a_million_photons_is_served(seed):
     sensor = random_sensor(rng, 16)
     photons = 10 ** rng.uniform(-3, 6)
     codes = sensor.sample(np.full((32, 64), photons), EXPOSURE, key=Key(seed, 1), engine="reference").astype(float)
-    mean, a = float(sensor.arrivals(photons, EXPOSURE)), sensor.dead_time / EXPOSURE
+    mean = float(sensor.arrivals(photons, EXPOSURE))
+    a = sensor.dead_time / EXPOSURE
     expected = -np.expm1(-mean * min(a, 1)) + mean * np.exp(-mean * a) * max(1 - a, 0)
     if expected + 8 * np.sqrt(expected) > 65535:
         assert codes.max() <= 65535

@@ -27,7 +27,8 @@ def test_poisson_probabilities_keep_their_digits(mean):
 def test_the_error_of_the_process_is_below_1e_13(mean):
     """Drawing by inversion is as exact as the functions it inverts: P(N <= n) and P(N > n) against 40 digits."""
     n = np.unique(np.maximum(np.floor(mean + np.sqrt(mean) * np.arange(-9, 12)), 0)).astype(int)
-    below, above = pdtr(n, mean), pdtrc(n, mean)
+    below = pdtr(n, mean)
+    above = pdtrc(n, mean)
     with mp.workdps(40):
         exact = [poisson_cdf(int(i), mean) for i in n]
         assert max(abs(below[i] - float(p)) for i, p in enumerate(exact)) < 1e-13
@@ -58,7 +59,8 @@ def test_poisson_quantiles_invert_the_distribution_in_both_tails():
             n, np.repeat(means, below.size), np.tile(below, means.size), np.tile(above, means.size), strict=True
         ):
             exact = 1 - mp.mpf(v) if v < 0.5 else mp.mpf(u)
-            upper, lower = poisson_cdf(int(found), mean), poisson_cdf(int(found) - 1, mean)
+            upper = poisson_cdf(int(found), mean)
+            lower = poisson_cdf(int(found) - 1, mean)
             assert lower <= exact < upper, (found, mean, u, v)
 
 

@@ -22,7 +22,8 @@ LIGHT = np.array([0.0, *10.0 ** np.arange(-12, 13, 3), 0.03, 0.5, 3.25, 9.75, 26
 def oracle(sensor: QIS, photons: np.ndarray, levels: list[int]) -> tuple[list, list, list]:
     """P(code <= k), P(code = k), dP(code <= k)/dphotons for some k, by the definition, with 60 digits: [photons][k]."""
     with mp.workdps(60):
-        top, sigma = sensor.levels - 1, mp.mpf(sensor.read_noise)
+        top = sensor.levels - 1
+        sigma = mp.mpf(sensor.read_noise)
         well = mp.mpf(sensor.full_well) if sensor.full_well is not None else mp.inf
         highest = (mp.mpf(max(k for k in levels if k < top)) + 0.5 - mp.mpf(sensor.offset)) / mp.mpf(sensor.gain)
         last = max(int(mp.ceil(min(well, highest + 45 * sigma))) + 2, 1)
@@ -41,7 +42,9 @@ def oracle(sensor: QIS, photons: np.ndarray, levels: list[int]) -> tuple[list, l
             return a[0] - b[0] if a[0] < 0.5 else b[1] - a[1]
 
         table = {k: [at_most(k, n) for n in range(last + 2)] for k in {j for k in levels for j in (k - 1, k)}}
-        cdf, pmf, slope = [], [], []
+        cdf = []
+        pmf = []
+        slope = []
         for light in photons:
             mean = mp.mpf(sensor.quantum_efficiency) * mp.mpf(light) + mp.mpf(sensor.dark_current) * mp.mpf(EXPOSURE)
             weights = [mp.e**-mean]
@@ -133,7 +136,8 @@ def test_tails_are_probabilities_not_differences():
     ],
 )
 def test_extreme_light_is_a_distribution(sensor, photons):
-    cdf, pmf = sensor.cdf(photons, EXPOSURE), sensor.pmf(photons, EXPOSURE)
+    cdf = sensor.cdf(photons, EXPOSURE)
+    pmf = sensor.pmf(photons, EXPOSURE)
     assert np.all(np.diff(cdf) >= -1e-15)
     assert cdf[-1] == pytest.approx(1.0, abs=1e-13)
     assert pmf.sum() == pytest.approx(1.0, abs=1e-12)
@@ -145,7 +149,8 @@ def test_wide_codes_are_computed_in_blocks_that_fit():
     """12 bits are 16 tables; their seams carry the same distribution as one Gaussian-smoothed Poisson."""
     sensor = QIS(0.6, 0.0, 2.0, 12, gain=1.3, offset=64.0)
     photons = np.array([0.0, 300.0, 2000.0])
-    pmf, codes = sensor.pmf(photons, EXPOSURE), np.arange(4096)
+    pmf = sensor.pmf(photons, EXPOSURE)
+    codes = np.arange(4096)
     np.testing.assert_allclose(np.cumsum(pmf, axis=1), sensor.cdf(photons, EXPOSURE), atol=1e-10)
     mean = 1.3 * 0.6 * photons + 64
     np.testing.assert_allclose(pmf @ codes, mean, rtol=1e-9)
@@ -155,8 +160,10 @@ def test_wide_codes_are_computed_in_blocks_that_fit():
 
 def test_many_electrons_per_code_are_computed_in_blocks_that_fit():
     """A hundredth of a code per electron: tables of 40 codes and 4000 electrons each, against one sum over all."""
-    sensor, light = QIS(0.8, 0.0, 7.0, 8, gain=0.01), np.array([0.0, 900.0, 12_000.0])
-    pmf, codes = sensor.pmf(light, EXPOSURE), np.arange(256)
+    sensor = QIS(0.8, 0.0, 7.0, 8, gain=0.01)
+    light = np.array([0.0, 900.0, 12_000.0])
+    pmf = sensor.pmf(light, EXPOSURE)
+    codes = np.arange(256)
     np.testing.assert_allclose(np.cumsum(pmf, axis=1), sensor.cdf(light, EXPOSURE), atol=1e-11)
     electrons = np.arange(12_000)
     weights = np.exp(poisson_log_pmf(0.8 * light[2], electrons))

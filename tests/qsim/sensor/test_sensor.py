@@ -74,7 +74,8 @@ def test_no_two_frames_or_clips_share_their_noise(sensor: Sensor):
 
 def test_blocks_of_rows_do_not_show():
     """More levels mean fewer rows at a time: the same frame in one piece, row by row."""
-    sensor, light = QIS(0.8, 1.6, 0.2, 6), np.random.default_rng(0).uniform(0, 60, (90, 65))
+    sensor = QIS(0.8, 1.6, 0.2, 6)
+    light = np.random.default_rng(0).uniform(0, 60, (90, 65))
     whole = sensor.sample(light, EXPOSURE, key=Key(1, 1), engine="reference")
     key = Key(1, 1)
     rows = [sensor.sample(light[y : y + 1], EXPOSURE, key=key, origin=(y, 0), engine="reference") for y in range(90)]
@@ -121,7 +122,8 @@ def test_types_and_shapes_of_codes():
 def test_without_a_compiler_the_reference_serves_and_says_so_once(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(jit, "available", lambda: False)
     fast_engine_works.cache_clear()
-    sensor, light = SENSORS[0], np.full((4, 5), 2.0)
+    sensor = SENSORS[0]
+    light = np.full((4, 5), 2.0)
     try:
         with pytest.warns(UserWarning, match="no usable LLVM or CUDA: codes are drawn by the NumPy engine"):
             codes = sensor.sample(light, EXPOSURE, key=Key(1, 1))
@@ -134,7 +136,8 @@ def test_without_a_compiler_the_reference_serves_and_says_so_once(monkeypatch: p
 
 
 def test_mean_of_a_stack_is_the_closed_form_and_a_bias_is_caught():
-    sensor, light = SENSORS[0], np.full((10, 80, 81), 3.25)
+    sensor = SENSORS[0]
+    light = np.full((10, 80, 81), 3.25)
     codes = sensor.sample(light, EXPOSURE, key=Key(4, 4), engine="reference")
     variance = float(sensor.variance(3.25, EXPOSURE))
     assert_mean(codes, float(sensor.mean(3.25, EXPOSURE)), variance)

@@ -15,9 +15,11 @@ from qsim.sensor.spad import BinarySPAD
 def binomial_oracle(planes: int, photons: float, pde: float, dark: float) -> tuple[list, list]:
     """Binomial(M, p) and dF_k/dphotons = dp/dphotons dF_k/dp, the latter summed from the pmf's own derivatives."""
     rate = (mp.mpf(pde) * mp.mpf(photons) + mp.mpf(dark)) / planes
-    q, p = mp.e**-rate, -mp.expm1(-rate)
+    q = mp.e**-rate
+    p = -mp.expm1(-rate)
     pmf = [mp.binomial(planes, k) * p**k * q ** (planes - k) for k in range(planes + 1)]
-    slope, total = [], mp.mpf(0)
+    slope = []
+    total = mp.mpf(0)
     for k in range(planes):  # d pmf / dp = C(M, k) [k p^(k-1) q^(M-k) - (M-k) p^k q^(M-k-1)], dp/dphotons = pde q / M
         rises = k * p ** (k - 1) * q ** (planes - k) if k else 0
         total += mp.binomial(planes, k) * (rises - (planes - k) * p**k * q ** (planes - k - 1))
@@ -26,7 +28,8 @@ def binomial_oracle(planes: int, photons: float, pde: float, dark: float) -> tup
 
 
 def binary_errors(bits: int) -> np.ndarray:
-    sensor, worst = BinarySPAD(0.4, 0.01, bits), np.zeros(3)
+    sensor = BinarySPAD(0.4, 0.01, bits)
+    worst = np.zeros(3)
     with mp.workdps(400):  # the oracle's slope is a sum that cancels
         for photons in (0.0, *10.0 ** np.arange(-12, 13, 3), 0.3, 3.25, 26.0, 200.0, 1500.0, 2e4):
             worst = np.maximum(worst, errors(sensor, photons, *binomial_oracle(sensor.planes, photons, 0.4, 0.01)))
@@ -71,7 +74,8 @@ def test_planes_that_see_their_own_instant_are_summed_in_groups():
 
 def test_planes_at_constant_light_are_the_codes_of_a_stack():
     """A clip at the plane rate whose light holds still for each code: the same codes as at the code rate."""
-    sensor, light = BinarySPAD(0.4, 50.0, 2), np.random.default_rng(1).uniform(0, 9, (3, 6, 9))
+    sensor = BinarySPAD(0.4, 50.0, 2)
+    light = np.random.default_rng(1).uniform(0, 9, (3, 6, 9))
     key = Key(2, 3, frame=4)
     planes = sensor.sample_planes(np.repeat(light / 3, 3, axis=0), 1e-4, key=key, engine="reference")
     np.testing.assert_array_equal(planes, sensor.sample(light, 3e-4, key=key, engine="reference"))

@@ -25,14 +25,16 @@ def chain(sensor: SpikeCamera, electrons: np.ndarray, start: np.ndarray | None =
 
     An independent reference: it adds up all charges and all numbers of electrons of each plane [T] that matter.
     """
-    m, most = sensor.threshold, int(electrons.sum() + 12 * np.sqrt(electrons.sum()) + 30) + sensor.threshold
+    m = sensor.threshold
+    most = int(electrons.sum() + 12 * np.sqrt(electrons.sum()) + 30) + sensor.threshold
     charge = np.zeros(most)
     charge[:m] = 1 / m if start is None else start
     trains = charge[None]  # probability of [train so far, charge]
     for mean in electrons:
         step = poisson.pmf(np.arange(most), mean)
         grown = np.stack([np.convolve(row, step)[:most] for row in trains])
-        quiet, fired = grown.copy(), np.zeros_like(grown)
+        quiet = grown.copy()
+        fired = np.zeros_like(grown)
         quiet[:, m:] = 0
         if sensor.subtracts:
             fired[:, : most - m] = grown[:, m:]
@@ -65,7 +67,8 @@ def test_trains_of_spikes_have_the_law_of_the_chain(case: int):
 
 def test_a_wrong_reset_would_be_noticed():
     """The chain of one reset does not fit the spikes of the other."""
-    sensor, photons = SpikeCamera(1.0, 0.0, 5), np.full(5, 4.0)
+    sensor = SpikeCamera(1.0, 0.0, 5)
+    photons = np.full(5, 4.0)
     law, _ = chain(replace(sensor, subtracts=False), photons)
     with pytest.raises(AssertionError):
         assert_histogram(drawn_trains(sensor, photons, 20_000, 1), law / law.sum())
@@ -92,12 +95,14 @@ def test_the_law_of_a_plane_is_that_of_the_chain_in_the_long_run(subtracts: bool
         for light in (0.05, 0.4, 0.8):
             sensor = SpikeCamera(0.5, 0.0, threshold, subtracts)
             mean = np.array([light * threshold])
-            state, fired = np.full(threshold, 1 / threshold), 0.0
+            state = np.full(threshold, 1 / threshold)
+            fired = 0.0
             for _ in range(300):
                 law, after = chain(sensor, mean, state)
                 if subtracts:  # charge above the threshold waits: keep what the next start may hold
                     break
-                state, fired = after[:threshold] / after[:threshold].sum(), law[1]
+                state = after[:threshold] / after[:threshold].sum()
+                fired = law[1]
             if subtracts:
                 fired = _with_backlog(threshold, float(mean[0]))
             expected = sensor.pmf(mean / 0.5, EXPOSURE)[0, 1]
@@ -148,9 +153,11 @@ def test_crops_and_blocks_hold_the_same_spikes(data):
     shape = tuple(data.draw(st.integers(1, most)) for most in (6, 8, 11))
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
     light = rng.uniform(0, 30, shape)
-    sensor, key = SpikeCamera(0.8, 0.0, 17, bool(rng.integers(2))), Key(seed=3, clip=1, frame=4)
+    sensor = SpikeCamera(0.8, 0.0, 17, bool(rng.integers(2)))
+    key = Key(seed=3, clip=1, frame=4)
     full = sensor.sample(light, EXPOSURE, key=key)
-    y, x = data.draw(st.integers(0, shape[1] - 1)), data.draw(st.integers(0, shape[2] - 1))
+    y = data.draw(st.integers(0, shape[1] - 1))
+    x = data.draw(st.integers(0, shape[2] - 1))
     crop = sensor.sample(light[:, y:, x:], EXPOSURE, key=key, origin=(y, x))
     np.testing.assert_array_equal(crop, full[:, y:, x:])
     cut = data.draw(st.integers(0, shape[0]))

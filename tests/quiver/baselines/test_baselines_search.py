@@ -24,7 +24,8 @@ REFUSALS = (
 
 def random_sensor(rng, photons, most):
     """A sensor of 1 to `most` bits; every third one has the gain rule of the named sensors."""
-    bits, dark = int(rng.integers(1, most + 1)), float(rng.choice([0, 1.6, 25, 3200, 1e4]))
+    bits = int(rng.integers(1, most + 1))
+    dark = float(rng.choice([0, 1.6, 25, 3200, 1e4]))
     match rng.integers(6):
         case 0:
             return devices.quiver_physical(photons, bits)
@@ -32,7 +33,8 @@ def random_sensor(rng, photons, most):
             return devices.quiver_published(photons, bits)
         case 2 | 3:
             well = None if rng.random() < 0.7 else float(10 ** rng.uniform(-1, 3))
-            noise, offset = float(rng.choice([0, 0.2, 0.5, 2, 6.6])), float(rng.choice([0, 0, 3, 32, -5, -300]))
+            noise = float(rng.choice([0, 0.2, 0.5, 2, 6.6]))
+            offset = float(rng.choice([0, 0, 3, 32, -5, -300]))
             return QIS(rng.uniform(0.1, 1), dark, noise, bits, float(10 ** rng.uniform(-1.5, 2)), offset, well)
         case 4:
             return BinarySPAD(rng.uniform(0.05, 1), dark, bits)
@@ -44,7 +46,8 @@ def check(seed, names, most=8):
     """Restore one small stream of at most `most` bits with these methods; returns how many restored it."""
     rng = np.random.default_rng(seed)
     photons = float(10 ** rng.uniform(-1, np.log10(300)))
-    sensor, shape = random_sensor(rng, photons, most), tuple(int(n) for n in rng.integers(1, (4, 20, 20)))
+    sensor = random_sensor(rng, photons, most)
+    shape = tuple(int(n) for n in rng.integers(1, (4, 20, 20)))
     match rng.integers(4):
         case 0:
             codes = np.zeros(shape, np.uint8)

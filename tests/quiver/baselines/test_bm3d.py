@@ -45,7 +45,8 @@ def test_matching_is_an_exhaustive_search():
             at = [(int(p) // width - bm3d.RADIUS, int(p) % width - bm3d.RADIUS) for p in stack]
             seen.add(at[0])
             y, x = at[0]
-            rows, columns = range(max(0, y - 19), min(19, y + 20)), range(max(0, x - 19), min(34, x + 20))
+            rows = range(max(0, y - 19), min(19, y + 20))
+            columns = range(max(0, x - 19), min(34, x + 20))
             window = {(r, c): float((blocks[r, c] - blocks[y, x]).square().sum()) for r in rows for c in columns}
             close = sorted(d for d in window.values() if d <= 4000 * 64)
             assert len(stack) == min(16, 2 ** int(np.log2(len(close))))

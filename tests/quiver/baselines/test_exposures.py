@@ -38,7 +38,8 @@ def drawn(sensor, light: np.ndarray, shares: np.ndarray, seed: int) -> np.ndarra
 @pytest.mark.parametrize("kind", SENSORS)
 def test_the_likelihood_is_the_maximum_of_the_exact_one(kind):
     """Random light over five decades and random windows: no light is likelier than the estimate, but for the grid."""
-    sensor, rng = SENSORS[kind], np.random.default_rng(5)
+    sensor = SENSORS[kind]
+    rng = np.random.default_rng(5)
     shares = rng.choice(SCHEDULE, 7)
     light = 10 ** rng.uniform(-1.5, 3, 60)
     codes = drawn(sensor, light, shares, 1)
@@ -58,7 +59,8 @@ def test_the_likelihood_is_the_maximum_of_the_exact_one(kind):
 
 @pytest.mark.parametrize("kind", SENSORS)
 def test_equal_exposures_give_the_answers_of_the_usual_methods(kind):
-    sensor, rng = SENSORS[kind], np.random.default_rng(6)
+    sensor = SENSORS[kind]
+    rng = np.random.default_rng(6)
     light = rng.uniform(0, 0.7, 200) * sensor.white(EXPOSURE)
     shares = np.ones(5)
     codes = drawn(sensor, light, shares, 2)
@@ -73,7 +75,8 @@ def test_equal_exposures_give_the_answers_of_the_usual_methods(kind):
 @pytest.mark.parametrize("method", ["moment", "likelihood"])
 def test_a_bracket_sees_light_beyond_white(kind, method):
     """At 8 times white, full exposures are all saturated; 30 brackets find the light, and dim light too."""
-    sensor, count = SENSORS[kind], 400
+    sensor = SENSORS[kind]
+    count = 400
     shares = np.resize(SCHEDULE, 90)
     for level in (0.3, 8.0):
         light = np.full(count, level * sensor.white(EXPOSURE))
@@ -86,7 +89,8 @@ def test_a_bracket_sees_light_beyond_white(kind, method):
 
 def test_the_naive_mean_leaves_saturated_codes_out():
     """Light beyond white comes from short exposures, of which the darker codes stay: 15 % low at 6 times white."""
-    sensor, shares = SENSORS["QIS"], np.resize(SCHEDULE, 30)
+    sensor = SENSORS["QIS"]
+    shares = np.resize(SCHEDULE, 30)
     light = np.full(400, 6 * sensor.white(EXPOSURE))
     codes = drawn(sensor, light, shares, 4)
     found = exposures.restore(codes, sensor, EXPOSURE, shares, method="naive", window=30, frames=range(15, 16))
@@ -117,7 +121,8 @@ def test_a_method_without_exposures_is_refused():
 @pytest.mark.parametrize("kind", SENSORS)
 def test_the_likelihood_in_parts_is_the_same(kind, monkeypatch):
     """One chunk, chunks of several pixels, and of one."""
-    sensor, shares = SENSORS[kind], np.resize(SCHEDULE, 6)
+    sensor = SENSORS[kind]
+    shares = np.resize(SCHEDULE, 6)
     codes = drawn(sensor, 10 ** np.random.default_rng(7).uniform(-1.5, 3, 70), shares, 5)[:, 0]
     whole = exposures.likelihood(codes, shares, sensor, EXPOSURE)
     for pixels in (16, 1):
@@ -142,7 +147,8 @@ def test_the_memory_of_the_likelihood_does_not_grow_with_pixels_times_codes(monk
 
 def test_the_likelihood_sees_dim_light_of_many_bits():
     """The brightest light of 8 bits is so bright that levels from 1e-5 of it on began at 1.3 photons."""
-    sensor, shares = BinarySPAD(1.0, 0.0, bits=8), np.resize(SCHEDULE, 12)
+    sensor = BinarySPAD(1.0, 0.0, bits=8)
+    shares = np.resize(SCHEDULE, 12)
     codes = drawn(sensor, np.full(4000, 0.6), shares, 9)[:, 0]
     assert exposures.likelihood(codes, shares, sensor, EXPOSURE).mean() == pytest.approx(0.6, rel=0.05)
 
@@ -162,7 +168,8 @@ def test_a_table_of_likelihoods_that_is_too_large_is_refused(monkeypatch):
 @pytest.mark.parametrize("gain", [0.4095, 0.2], ids=["at the top code", "below it"])
 def test_the_naive_mean_leaves_codes_at_the_full_well_out(gain):
     """Light of four full wells on 12 bits: read noise spreads saturated codes, and few of them are the top one."""
-    sensor, light = QIS(0.6, 100.0, 5.0, 12, gain=gain, full_well=1e4), 4e4 / 0.6
+    sensor = QIS(0.6, 100.0, 5.0, 12, gain=gain, full_well=1e4)
+    light = 4e4 / 0.6
     shares = np.resize(SCHEDULE, 30)
     codes = drawn(sensor, np.full(200, light), shares, 10)[:, 0]
     assert exposures.naive(codes, shares, sensor, EXPOSURE).mean() == pytest.approx(light, rel=0.1)
@@ -170,9 +177,12 @@ def test_the_naive_mean_leaves_codes_at_the_full_well_out(gain):
 
 def test_the_full_well_of_few_bits_leaves_no_code_out():
     """Random sensors of 1 to 8 bits: the naive mean is that of the same sensor without a full well."""
-    rng, shares = np.random.default_rng(11), np.resize(SCHEDULE, 6)
+    rng = np.random.default_rng(11)
+    shares = np.resize(SCHEDULE, 6)
     for bits in np.repeat(range(1, 9), 4):
-        noise, gain, well = rng.uniform(0, 3), rng.uniform(0.2, 1.2), rng.uniform(1, 2.0**bits)
+        noise = rng.uniform(0, 3)
+        gain = rng.uniform(0.2, 1.2)
+        well = rng.uniform(1, 2.0**bits)
         sensor = QIS(0.6, 100.0, noise, int(bits), gain=gain, full_well=well)
         codes = rng.integers(0, 2**bits, (6, 50))
         found, without = (

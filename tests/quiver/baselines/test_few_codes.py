@@ -22,7 +22,8 @@ DETECTIONS = np.geomspace(0.05, 1.5, 12)
 @pytest.mark.parametrize(("window", "seen", "bits"), [(11, 11, 1), (11, 6, 1), (15, 8, 1), (3, 3, 3), (1, 1, 4)])
 def test_few_binary_planes_are_unbiased_at_the_ends_of_a_clip_too(method, window, seen, bits):
     """Binomial expectations over every number of detections; the first frame in a window of 11 sees 6 frames."""
-    rng, top = np.random.default_rng(3), 2**bits - 1
+    rng = np.random.default_rng(3)
+    top = 2**bits - 1
     totals = np.arange(seen * top + 1)
     codes = np.zeros((window, 1, len(totals)), np.uint8)
     codes[:seen, 0] = np.clip(totals - np.arange(seen)[:, None] * top, 0, top)  # any codes of this sum
@@ -44,7 +45,9 @@ def test_few_binary_planes_are_unbiased_at_the_ends_of_a_clip_too(method, window
 @pytest.mark.parametrize("bits", [1, 2])
 def test_sums_of_planes_in_a_schedule_are_unbiased(method, bits):
     """Three exposures in turn, binomial draws of our own; the tolerance is the bound and that of 20 000 pixels."""
-    rng, shares, top = np.random.default_rng(4), np.resize([1, 0.25, 0.0625], 11), 2**bits - 1
+    rng = np.random.default_rng(4)
+    shares = np.resize([1, 0.25, 0.0625], 11)
+    top = 2**bits - 1
     sensor = BinarySPAD(0.4, 200.0, bits)
     for detections in DETECTIONS[::4]:
         light = detections * top / 0.4

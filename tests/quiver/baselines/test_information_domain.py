@@ -55,7 +55,9 @@ def test_phi_of_a_photon_counter_is_twice_a_square_root():
 def test_the_noise_of_phi_has_the_stated_deviation(seed):
     """The mean of 400 codes, drawn 4000 times: the delta method errs by a few percent, the draw by 1.1 % rms."""
     rng = np.random.default_rng(100 + seed)
-    sensor, codes, draws = random_sensor(rng), 400, 4000
+    sensor = random_sensor(rng)
+    codes = 400
+    draws = 4000
     domain = information_domain(sensor, EXPOSURE)
     chosen = rng.uniform(0.1, 0.9) * domain.mean_code[-1]
     photons = float(np.interp(chosen, domain.mean_code, domain.photons))
@@ -80,7 +82,9 @@ def test_the_noise_of_phi_has_the_stated_deviation(seed):
 )
 def test_noise_of_a_dark_pixel_is_no_light(sensor):
     """Cut off at darkness, the mean of phi would be 0.4 deviations instead of none."""
-    domain, codes, draws = information_domain(sensor, EXPOSURE), 400, 4000
+    domain = information_domain(sensor, EXPOSURE)
+    codes = 400
+    draws = 4000
     pmf = sensor.pmf(np.array(0.0), EXPOSURE)
     counts = np.random.default_rng(0).multinomial(codes, pmf / pmf.sum(), size=draws)
     phi = domain.forward(counts @ np.arange(sensor.levels) / codes)
@@ -100,7 +104,8 @@ def test_a_dark_pixel_below_a_high_threshold_is_finite(gain):
 def test_photons_come_back_where_codes_tell_something(seed):
     domain = information_domain(random_sensor(np.random.default_rng(200 + seed)), EXPOSURE)
     inner = (domain.mean_code > 0.02 * domain.mean_code[-1]) & (domain.mean_code < 0.98 * domain.mean_code[-1])
-    photons, phi = domain.photons[inner], domain.phi[inner]
+    photons = domain.photons[inner]
+    phi = domain.phi[inner]
     assert domain.inverse(phi) == pytest.approx(photons, rel=1e-5)
     assert domain.forward(domain.mean_code[inner]) == pytest.approx(phi, rel=1e-5)
 

@@ -26,7 +26,8 @@ def plain_agreement(difference, variance):
     cells = difference.reshape(difference.shape[0] // 2, 2, -1, 2).mean((1, 3))
 
     def box(x, radius):
-        grown, side = np.pad(x, radius, mode="edge"), 2 * radius + 1
+        grown = np.pad(x, radius, mode="edge")
+        side = 2 * radius + 1
         rows, columns = (range(length) for length in x.shape)
         return np.array([[grown[y : y + side, z : z + side].mean() for z in columns] for y in rows])
 
@@ -155,7 +156,8 @@ def test_any_size_and_any_number_of_frames(shape):
 
 def test_saturated_pixels_near_the_ends_saw_the_frames_that_exist():
     """One saturated plane had the light of eleven."""
-    sensor, window = BinarySPAD(1.0, 0.0, 1), 11
+    sensor = BinarySPAD(1.0, 0.0, 1)
+    window = 11
     for length, seen in ((1, 1), (20, 6)):
         first = pm.restore(np.ones((length, 16, 16), np.uint8), sensor, EXPOSURE, window=window)[0]
         np.testing.assert_allclose(first, sensor.response(EXPOSURE).cap(seen), rtol=1e-6)
@@ -178,7 +180,8 @@ def test_a_stream_reads_each_frame_once_and_no_further_than_its_delay():
 
 def test_threads_change_nothing():
     codes = np.random.default_rng(4).integers(0, 8, (5, 24, 32)).astype(np.uint8)
-    before, found = torch.get_num_threads(), []
+    before = torch.get_num_threads()
+    found = []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
@@ -194,7 +197,8 @@ def test_a_shift_of_the_scene_by_a_pixel_shifts_the_answer():
     light = 3 * np.exp(gaussian_filter(rng.normal(size=(72, 88)), 2) * 4)
     frames = np.stack([shift(light, (0, 1.5 * k), order=1, mode="nearest") for k in range(-5, 6)])
     codes = SENSOR.sample(np.clip(frames, 0, None), EXPOSURE, key=Key(3, 3), engine="reference")
-    one, other = merged(codes[:, :-8, :-8], 5), merged(codes[:, 1:-7, 1:-7], 5)
+    one = merged(codes[:, :-8, :-8], 5)
+    other = merged(codes[:, 1:-7, 1:-7], 5)
     apart = (one.mean_code[1:, 1:] - other.mean_code[:-1, :-1])[16:-16, 16:-16]
     error = (one.mean_code - SENSOR.mean(np.clip(frames[5], 0, None), EXPOSURE)[:-8, :-8])[16:-16, 16:-16]
     assert np.sqrt((apart**2).mean()) < 0.35 * np.sqrt((error**2).mean())

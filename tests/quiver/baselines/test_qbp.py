@@ -40,7 +40,8 @@ def pyramid_of(image):
 @pytest.mark.parametrize("motion", [(0.0, 0.0), (2.65, 0.0), (-3.3, 7.7), (12.4, -20.2)])
 def test_alignment_finds_a_known_shift_of_a_noiseless_picture(motion):
     """Patches that stay inside the picture: refined within 0.05 px, in whole pixels within 3/4."""
-    picture, shape = texture((192, 256)), (192, 256)
+    picture = texture((192, 256))
+    shape = (192, 256)
     reference, other = (pyramid_of(view(picture, *m)) for m in ((0, 0), motion))
     corner = patch_alignment.grid(reference[0].shape, patch_alignment.LEVELS[0])[0]
     seen = [(corner[k] > 32) & (corner[k] < shape[k] - 64) for k in (0, 1)]
@@ -80,16 +81,19 @@ def test_derivatives_and_bicubic_samples_of_polynomials():
     torch.testing.assert_close(dy[4:-4, 4:-4], (0.02 * (y - 9))[4:-4, 4:-4], atol=1e-5, rtol=0)
     parabola = 0.1 * x**2 - 0.05 * y**2 + 0.3 * x * y
     at = torch.tensor([[3.3, 5.0], [7.25, 4.9]])
-    cubic, linear = patch_alignment.sample_cubic(parabola, at, 4), patch_alignment.sample_linear(x + 2 * y, at, 4)
+    cubic = patch_alignment.sample_cubic(parabola, at, 4)
+    linear = patch_alignment.sample_linear(x + 2 * y, at, 4)
     step = torch.arange(4.0)
-    yy, xx = at[0] + step[:, None, None], at[1] + step[None, :, None]
+    yy = at[0] + step[:, None, None]
+    xx = at[1] + step[None, :, None]
     torch.testing.assert_close(cubic, 0.1 * xx**2 - 0.05 * yy**2 + 0.3 * xx * yy, atol=1e-4, rtol=0)
     torch.testing.assert_close(linear, xx + 2 * yy, atol=1e-5, rtol=0)
 
 
 def test_candidates_are_the_parent_and_its_nearer_neighbours():
     """Two coarse rows and three columns; eight fine rows per two parents, and the first row looks onwards."""
-    fine, coarse = patch_alignment.LEVELS[0], patch_alignment.LEVELS[1]
+    fine = patch_alignment.LEVELS[0]
+    coarse = patch_alignment.LEVELS[1]
     parent = torch.arange(6.0).reshape(1, 2, 3).expand(2, -1, -1)
     first, down, across = (c[0].reshape(7, 11) / 2 for c in patch_alignment.candidates(parent, 7, 11, fine, coarse))
     assert first[:, 0].tolist() == [0, 0, 0, 0, 3, 3, 3]
@@ -111,7 +115,8 @@ def ball_shifts(ppp, settings):
     sensor = quiver_physical(ppp)
     codes = sensor.sample(light, EXPOSURE, key=Key(3, 4), engine="reference")
     corner = patch_alignment.grid(torch.Size((384, 192)), patch_alignment.LEVELS[0])[0]
-    on_ball, on_plate = [], []
+    on_ball = []
+    on_plate = []
     for middle in (5, 7, 9):
         stack = torch.from_numpy(codes[middle - 5 : middle + 6].astype(np.float32) / 7)
         stack = torch.stack([patch_alignment.pad_image(image) for image in stack])
@@ -161,11 +166,14 @@ def test_shifts_near_the_ends_follow_the_motion(windows):
     Frames beyond the ends were reflections, and took the shift of the place that they filled. A single block has
     nothing to be matched with.
     """
-    rng, picture = np.random.default_rng(6), texture((64, 128))
+    rng = np.random.default_rng(6)
+    picture = texture((64, 128))
     for _ in range(windows):
         block = int(rng.choice([1, 1, 3]))
-        window, length = block * int(rng.integers(2, 12)), int(rng.integers(2, 12))
-        frame, speed = int(rng.integers(length)), rng.uniform(-2, 2, 2)
+        window = block * int(rng.integers(2, 12))
+        length = int(rng.integers(2, 12))
+        frame = int(rng.integers(length))
+        speed = rng.uniform(-2, 2, 2)
         here = range(max(0, frame - window // 2), min(length, frame + (window - 1) // 2 + 1))
         if len(here) <= block:
             continue
@@ -184,7 +192,8 @@ def test_the_first_and_last_frames_are_merged_along_their_motion(backwards):
     """Six frames instead of eleven raise the error of noise to 11 / 6; a wrong shift of reflected frames raised it
     to more than twice that of a frame in the middle.
     """
-    light, sensor = moving(26.0, 11, 2.5, shape=(64, 128))[:: -1 if backwards else 1], quiver_physical(26.0)
+    light = moving(26.0, 11, 2.5, shape=(64, 128))[:: -1 if backwards else 1]
+    sensor = quiver_physical(26.0)
     codes = sensor.sample(light, EXPOSURE, key=Key(7, 8), engine="reference")
     restored = qbp.restore(codes, sensor, EXPOSURE)
     errors = np.mean((restored - light) ** 2, axis=(1, 2))
@@ -202,7 +211,8 @@ def moving(photons, frames, speed, shape=(72, 88)):
     ("settings", "gain"), [(qbp.CALIBRATED, 0.5), (qbp.AS_PUBLISHED, 0.8)], ids=["calibrated", "published"]
 )
 def test_merging_beats_both_one_frame_and_a_plain_mean_when_things_move(settings, gain):
-    light, sensor = moving(3.25, 11, 2.0), quiver_physical(3.25)
+    light = moving(3.25, 11, 2.0)
+    sensor = quiver_physical(3.25)
     codes = sensor.sample(light, EXPOSURE, key=Key(7, 7), engine="reference")
     merged = sensor.response(EXPOSURE).invert(qbp.merge(codes, 5, sensor.response(EXPOSURE), 11, settings), 11)
     errors = [
@@ -224,7 +234,8 @@ def test_little_light_on_many_bits_is_merged_as_on_eight():
     sensor = QIS(0.8, 1.6, 0.2, 8)
     codes = sensor.sample(moving(3.25, 11, 2.0), EXPOSURE, key=Key(7, 7), engine="reference")
     table = sensor.response(EXPOSURE)
-    expected, wide = qbp.merge(codes, 5, table, 11), replace(table, top=65535)
+    expected = qbp.merge(codes, 5, table, 11)
+    wide = replace(table, top=65535)
     np.testing.assert_allclose(qbp.merge(codes.astype(np.uint16), 5, wide, 11), expected, rtol=1e-5)
     hot = codes.astype(np.uint16)
     hot[:, 70, 86] = 65535
@@ -276,9 +287,11 @@ def test_the_other_frames_are_not_trusted_where_they_differ():
 def test_one_bit_streams(block):
     """Half a photon per pixel and frame; blocks of frames are aligned, and follow the motion within."""
     frames = 11 * block
-    light, sensor = moving(0.5, frames, 1.5 / block), BinarySPAD(0.4, 25.0, 1)
+    light = moving(0.5, frames, 1.5 / block)
+    sensor = BinarySPAD(0.4, 25.0, 1)
     codes = sensor.sample(light, EXPOSURE, key=Key(4, 4), engine="reference")
-    table, settings = sensor.response(EXPOSURE), qbp.Settings(block=block)
+    table = sensor.response(EXPOSURE)
+    settings = qbp.Settings(block=block)
     restored = table.invert(qbp.merge(codes, frames // 2, table, frames, settings), frames)
     plain = moment.restore(codes, sensor, EXPOSURE, window=frames)[frames // 2]
     middle = light[frames // 2]
@@ -287,7 +300,8 @@ def test_one_bit_streams(block):
 
 
 def test_whole_blocks_and_known_choices_only():
-    codes, sensor = np.zeros((4, 8, 10), np.uint8), quiver_physical(3.25)
+    codes = np.zeros((4, 8, 10), np.uint8)
+    sensor = quiver_physical(3.25)
     with pytest.raises(ValueError, match="window is 11 frames, which blocks of 4 do not divide"):
         qbp.restore(codes, sensor, EXPOSURE, settings=qbp.Settings(block=4))
     with pytest.raises(ValueError, match="prefilter 1 or 3"):
@@ -312,7 +326,8 @@ def test_every_method_takes_any_size_and_length(name, shape):
 @pytest.mark.parametrize("name", METHODS)
 def test_only_declared_frames_change_a_restored_frame(name):
     """Look-ahead and past: with a window of 3, frame 2 of 5 reads frames 1 and 3 but not 0 and 4."""
-    sensor, rng = quiver_physical(3.25), np.random.default_rng(5)
+    sensor = quiver_physical(3.25)
+    rng = np.random.default_rng(5)
     codes = rng.integers(0, 3, (5, 16, 16), dtype=np.uint8)
     base = METHODS[name].restore(codes, sensor, EXPOSURE, window=3)[2]
     for frames, read in (([0, 4], False), ([1], True), ([3], True)):

@@ -47,7 +47,8 @@ def estimator_moments(sensor, photons, window, restore):
 @pytest.mark.parametrize("photons", LEVELS)
 def test_flat_fields_have_the_mean_the_exact_distribution_predicts(name, photons):
     """2000 windows of a flat field, disjoint in time and space; variance of their mean from the exact distribution."""
-    sensor, window = SENSORS[name], 5
+    sensor = SENSORS[name]
+    window = 5
     restored = moment.restore(flat(sensor, photons, window), sensor, EXPOSURE, window=window)[window // 2]
     expected, variance, _, _ = estimator_moments(sensor, photons, window, moment.restore)
     sigma = np.sqrt(variance / restored.size) + 1e-6 * expected
@@ -63,7 +64,9 @@ def test_a_flat_field_is_recovered_within_four_standard_errors(method, photons):
     At 19.5 and 26 photons (6 and 8 times the level the gain is made for) nearly all codes are the top one: light is
     known only as a bound, and the estimate must reach it, up to the cap half a count below saturation.
     """
-    sensor, frames, shape = quiver_physical(3.25), 100, (2, 4)
+    sensor = quiver_physical(3.25)
+    frames = 100
+    shape = (2, 4)
     codes = flat(sensor, photons, frames, shape)
     middle = METHODS[method].restore(codes, sensor, EXPOSURE, window=2 * frames - 1)[0]
     information = float(sensor.fisher_information(np.array([photons]), EXPOSURE)[0])
@@ -100,7 +103,8 @@ def test_caps_and_dark_level_worked_by_hand():
 @pytest.mark.parametrize(("factor", "bias"), [(0.5, -0.041), (1, -0.037), (2, -0.096), (4, -0.389)])
 def test_the_naive_mean_is_as_biased_as_clipping_makes_it(factor, bias):
     """Expectation over one code, worked by hand for 3.25 photons per pixel."""
-    sensor, photons = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25), 3.25 * factor
+    sensor = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
+    photons = 3.25 * factor
     estimate = naive_mean.restore(np.arange(8, dtype=np.uint8).reshape(1, 1, 8), sensor, EXPOSURE, window=1)[0, 0]
     unclamped = np.where(estimate > 0, estimate, -naive_mean.dark_codes(sensor, EXPOSURE) * sensor.white(EXPOSURE) / 7)
     pmf = np.exp(sensor.log_pmf(np.array([photons]), EXPOSURE))[0]
@@ -109,7 +113,8 @@ def test_the_naive_mean_is_as_biased_as_clipping_makes_it(factor, bias):
 
 @pytest.mark.parametrize("name", ["naive", "moment", "likelihood"])
 def test_the_order_of_the_frames_in_a_window_does_not_matter(name):
-    sensor, rng = quiver_physical(3.25), np.random.default_rng(0)
+    sensor = quiver_physical(3.25)
+    rng = np.random.default_rng(0)
     codes = rng.integers(0, 8, (5, 8, 10), dtype=np.uint8)
     once = METHODS[name].restore(codes, sensor, EXPOSURE, window=5)[2]
     again = METHODS[name].restore(codes[[3, 1, 4, 0, 2]], sensor, EXPOSURE, window=5)[2]

@@ -45,7 +45,8 @@ def test_frames_near_the_ends_count_several_times():
 
 
 def test_wrong_codes_and_windows_are_named():
-    sensor, codes = quiver_physical(3.25), np.zeros((4, 8, 10), np.uint8)
+    sensor = quiver_physical(3.25)
+    codes = np.zeros((4, 8, 10), np.uint8)
     codes[2, 3, 5] = 9
     with pytest.raises(ValueError, match=r"0\.\.7 for a 3-bit sensor, found 9 at \(t, y, x\) = \(2, 3, 5\)"):
         moment.restore(codes, sensor, EXPOSURE)

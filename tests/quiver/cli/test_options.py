@@ -515,8 +515,10 @@ def few(setting: cost.CostSettings) -> cost.CostSettings:
 @pytest.fixture(scope="module")  # of this module alone: what it replaces is back for the next one
 def scale() -> Iterator[None]:
     """Small networks, one of six ablations, benches in process, no figures or CUDA; and notes of what runs did."""
-    measure_cell, score = domain_measurement.measure_cell, domain_measurement.score
-    fill_classical, loader = restorers.fill_classical, loop.DataLoader
+    measure_cell = domain_measurement.measure_cell
+    score = domain_measurement.score
+    fill_classical = restorers.fill_classical
+    loader = loop.DataLoader
 
     def one_cell(*args: Any) -> Cell:
         see("cell", args[-1])
@@ -540,7 +542,8 @@ def scale() -> Iterator[None]:
         see("workers", num_workers)
         return loader(windows, **named | {"multiprocessing_context": None})
 
-    number, ablations = torch.get_num_threads(), dict(ABLATIONS)
+    number = torch.get_num_threads()
+    ablations = dict(ABLATIONS)
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "quiver-s", TINY)
@@ -567,7 +570,8 @@ def scale() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the rows name."""
-    folder, rng = tmp_path_factory.mktemp("work"), np.random.default_rng(0)
+    folder = tmp_path_factory.mktemp("work")
+    rng = np.random.default_rng(0)
     size = {"frames": 12, "height": 16, "width": 24}
     write_dataset(folder / "data", {"train": 2, "val": 1, "test": 1}, **size)
     write_dataset(folder / "lone", {"train": 1}, **size)

@@ -53,7 +53,8 @@ def train_words(data: Path, out: Path) -> list[object]:
 
 def test_the_whole_chain(capsys, tiny_dataset, clip, tmp_path):
     """Train, resume, restore with the run, evaluate it beside a classical method."""
-    run_folder, video = tmp_path / "run", tmp_path / "video.npy"
+    run_folder = tmp_path / "run"
+    video = tmp_path / "video.npy"
     code, out, _ = run(capsys, *train_words(tiny_dataset, run_folder), "--json")
     found = json.loads(out)
     assert (code, found["steps"]) == (0, 2)
@@ -257,7 +258,8 @@ def test_force_starts_a_run_and_a_table_again(capsys, tmp_path, tiny_dataset):
 
 
 def test_force_removes_no_evaluation_before_the_new_one_is_checked(capsys, tmp_path, make_clip):
-    folder, out = make_clip(frames=9, split="test").path.parent, tmp_path / "t"
+    folder = make_clip(frames=9, split="test").path.parent
+    out = tmp_path / "t"
     words = ["evaluate", folder, "-o", out, "--methods", "naive"]
     assert run(capsys, *words)[0] == 0
     before = (out / "rows.jsonl").read_bytes()

@@ -152,7 +152,9 @@ def test_a_sensor_file_is_ablated_with_its_bits(tiny_dataset, tmp_path, monkeypa
 
 def test_an_ablation_has_clips_to_score_before_it_trains(capsys, make_clip: ClipMaker, tmp_path, monkeypatch):
     """A clip folder is in every split, so only `--split train` names what is scored there."""
-    clip, data, out = make_clip().path, write_dataset(tmp_path / "data", {"train": 1, "val": 1}), tmp_path / "x"
+    clip = make_clip().path
+    data = write_dataset(tmp_path / "data", {"train": 1, "val": 1})
+    out = tmp_path / "x"
     monkeypatch.setattr(ablation, "run_ablation", lambda *_, **__: None)
     capsys.readouterr()
     for source, message in (
@@ -292,7 +294,8 @@ def test_a_sensor_file_is_measured_with_its_bits(capsys, make_clip: ClipMaker, t
     [((20.0, 22.5, 22.0), "got worse: the last validation is 0.50 dB below the best"), ((20.0, 22.5, 22.5), None)],
 )
 def test_a_curve_that_falls_is_told(capsys, tiny_dataset, tmp_path, monkeypatch, scores, told):
-    found, validate = iter(scores), loop.validate
+    found = iter(scores)
+    validate = loop.validate
 
     def scripted(*args: object) -> tuple[Score, torch.Tensor]:
         score, picture = validate(*args)

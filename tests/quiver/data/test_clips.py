@@ -24,7 +24,8 @@ def test_a_clip_that_trains_does_not_validate(tiny_dataset):
 
 def test_clips_are_known_by_their_names_and_files(tiny_dataset, tmp_path):
     copied = shutil.copytree(tiny_dataset, tmp_path / "copied")
-    one, other = open_clips(tiny_dataset), open_clips(copied)
+    one = open_clips(tiny_dataset)
+    other = open_clips(copied)
     assert clips_digest(one[:3], one[3:]) == clips_digest(other[:3], other[3:])
     found = {clips_digest(one[:3]), clips_digest(one[:2]), clips_digest(one[:2], one[2:3]), clips_digest(one[1:4])}
     assert len(found) == 4

@@ -75,7 +75,8 @@ def test_sensors_that_fit_no_table_are_drawn_by_themselves():
 
 def test_a_paralyzable_counter_is_dark_far_above_its_brightest_light():
     """Its table ended where nearly every code was the top one, and held that code for all light above."""
-    sensor, photons = CountingSPAD(0.5, 25.0, 5e-6, 3, paralyzable=True), np.full((2, 5, 7), 2000.0)
+    sensor = CountingSPAD(0.5, 25.0, 5e-6, 3, paralyzable=True)
+    photons = np.full((2, 5, 7), 2000.0)
     codes = draw_codes(sensor, photons, EXPOSURE, Key(1, 2))
     np.testing.assert_array_equal(codes, sensor.sample(photons, EXPOSURE, key=Key(1, 2), engine="reference"))
     assert codes.max() < 5

@@ -47,7 +47,8 @@ def test_counting_pixels_with_a_memory_are_followed_as_by_qsim_sense(make_clip: 
     """The closed form drew them: without afterpulses, and live at the start of every exposure."""
     clip = make_clip(frames=4, height=6, width=7)
     file = sensor_file(tmp_path, COUNTER.replace("1e-5", "1e-4") + table, bits=3)
-    now, stored = sensed(clip, Illumination(file, 3.0, None))[0], sense(clip, Sensing(file, ppp=3.0))[0]
+    now = sensed(clip, Illumination(file, 3.0, None))[0]
+    stored = sense(clip, Sensing(file, ppp=3.0))[0]
     assert stored.meta["drawn_by"] == "events"
     np.testing.assert_array_equal(now.read(0, 4), stored.codes(0, 4))
     np.testing.assert_array_equal(now.read(2, 3), stored.codes(2, 3))
@@ -71,7 +72,8 @@ def test_splits(tiny_dataset):
 
 def test_single_frames_are_read_in_blocks(monkeypatch):
     """Blocks of four frames: three reads for ten frames in order, and each frame is that of the stream."""
-    source, reads = random_codes(10, 5, 7), []
+    source = random_codes(10, 5, 7)
+    reads = []
 
     def read(start: int, stop: int) -> np.ndarray:
         reads.append((start, stop))
@@ -101,7 +103,8 @@ def test_the_estimated_light_holds_no_noise(sensor, frames):
     light[:, :, 32:] = 0.95
     codes = sensor.sample(light, EXPOSURE, key=Key(0, frames), engine="reference")
     found = light_of(array_codes(codes, sensor, EXPOSURE))
-    table, read = sensor.response(EXPOSURE), min(frames, 11)
+    table = sensor.response(EXPOSURE)
+    read = min(frames, 11)
     slope, variance = (np.interp(light[0], table.photons, x) for x in (np.gradient(table.photons, table.mean),
                                                                       table.variance))  # fmt: skip
     sigma = np.sqrt((slope**2 * variance).sum() / read) / light[0].size

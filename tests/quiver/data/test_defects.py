@@ -23,7 +23,8 @@ from quiver.data.illumination import Illumination
 from quiver.data.windows import Windows, WindowSettings
 from quiver.restoration.restorers import restorer
 
-SENSOR, EXPOSURE = BinarySPAD(0.5, 0.0, 3), 1e-3
+SENSOR = BinarySPAD(0.5, 0.0, 3)
+EXPOSURE = 1e-3
 
 
 def test_masked_codes_are_never_read_and_good_ones_stay():
@@ -49,26 +50,30 @@ def test_the_fill_has_the_mean_of_its_neighbours(bits):
     for light in rng.uniform(0.02, 0.98, 4):
         bad = rng.random((40, 40)) < 0.13
         codes = rng.binomial(2**bits - 1, light, (60, 40, 40)).astype(np.uint8)
-        mean, variance = light * (2**bits - 1), light * (1 - light) * (2**bits - 1)
+        mean = light * (2**bits - 1)
+        variance = light * (1 - light) * (2**bits - 1)
         # A filled code varies no more than a good one and the rounding; neighbours share some of their sources
         assert_mean(Filler(bad).fill(codes, 0)[:, bad].astype(float), mean, 8 * (variance + 0.25), checks=12)
 
 
 def test_codes_that_the_sensor_cannot_produce_are_not_filled_in():
     """Two codes per electron and no read noise: no code is odd but the top one. Means of neighbours were."""
-    sensor, bad = qis.QIS(0.8, 100.0, 0.0, 3, gain=2.0), np.random.default_rng(5).random((40, 40)) < 0.13
+    sensor = qis.QIS(0.8, 100.0, 0.0, 3, gain=2.0)
+    bad = np.random.default_rng(5).random((40, 40)) < 0.13
     codes = sensor.sample(np.full((60, 40, 40), 2.0), EXPOSURE, key=Key(1, 3), engine="reference")
     found = filled(array_codes(codes, sensor, EXPOSURE), bad).read(0, 60)
     assert set(np.unique(found)) == {0, 2, 4, 6, 7}
     light = np.array([2.0])
-    mean, variance = float(sensor.mean(light, EXPOSURE)[0]), float(sensor.variance(light, EXPOSURE)[0])
+    mean = float(sensor.mean(light, EXPOSURE)[0])
+    variance = float(sensor.variance(light, EXPOSURE)[0])
     assert_mean(found[:, bad].astype(float), mean, 8 * variance)  # neighbours share some of their sources
 
 
 @pytest.mark.parametrize("name", sorted(METHODS))
 def test_every_method_restores_filled_codes_of_a_sensor_that_skips_some(name):
     """The likelihood of an impossible code is 0, which `likelihood` refuses."""
-    sensor, bad = qis.QIS(0.8, 100.0, 0.0, 3, gain=2.0), np.random.default_rng(3).random((20, 19)) < 0.13
+    sensor = qis.QIS(0.8, 100.0, 0.0, 3, gain=2.0)
+    bad = np.random.default_rng(3).random((20, 19)) < 0.13
     codes = sensor.sample(np.full((2, 20, 19), 2.0), EXPOSURE, key=Key(1, 1), engine="reference")
     assert np.isfinite(restorer(name).restore(filled(array_codes(codes, sensor, EXPOSURE), bad))).all()
 
@@ -160,7 +165,8 @@ def test_hot_pixels_do_not_darken_the_others(make_clip: ClipMaker, tmp_path, mod
     assert stored.sensor == now.sensor
     assert now.sensor.dark_rate == pytest.approx(20.0)
     # The variance of one code, in photons: shot noise over the efficiency, read noise and rounding
-    count, variance = now.defective.size * 11, (3.0 / 0.5) * 1.3
+    count = now.defective.size * 11
+    variance = (3.0 / 0.5) * 1.3
     found = METHODS["likelihood"].restore(now.read(0, 11), now.sensor, now.exposure)[:, ~now.defective]
     assert abs(found.mean() - 3.0) < 5 * np.sqrt(variance / count) * 1.5 + 0.02  # middle frames are in more windows
 
@@ -201,7 +207,8 @@ def test_light_is_estimated_where_no_code_is_saturated():
     """Random sensors, frames and light below white: 3 % of the light, and that of the spread frames."""
     rng = np.random.default_rng(4)
     for _ in range(20):
-        light, frames = float(rng.uniform(0.5, 4.0)), int(rng.integers(1, 30))
+        light = float(rng.uniform(0.5, 4.0))
+        frames = int(rng.integers(1, 30))
         stack = SENSOR.sample(np.full((frames, 60, 60), light), EXPOSURE, key=Key(2, frames), engine="reference")
         assert light_of(array_codes(stack, SENSOR, EXPOSURE)) == pytest.approx(light, rel=0.06)
 
@@ -216,11 +223,14 @@ def test_a_map_gives_back_what_hot_pixels_cost(name):
     measured = data.parent / "shared" / "data" / "spad512_darkcounts_YX.npy"
     if not measured.exists():
         pytest.skip(f"{measured} is not here: this measurement may not be copied into the repository")
-    rng, rates = np.random.default_rng(0), np.load(measured).ravel()
+    rng = np.random.default_rng(0)
+    rates = np.load(measured).ravel()
     counts = np.load(data / "tests/data/hazelnut_gates6.npz")["gates"].sum((0, 1))[40:200, 40:200].astype(float)
-    light, hot = counts / counts.mean() * 4.0, rng.random((160, 160)) < 0.133
+    light = counts / counts.mean() * 4.0
+    hot = rng.random((160, 160)) < 0.133
     dark = np.where(hot, 7 * 30 * rng.choice(rates[rates > 3 * np.median(rates)], hot.shape), 0.0)
-    sensor, white = BinarySPAD(1.0, 0.0, 3), 2.5 * light.mean()
+    sensor = BinarySPAD(1.0, 0.0, 3)
+    white = 2.5 * light.mean()
     found = []
     for seen, bad in ((light + dark, None), (light + dark, hot), (light, None)):
         photons = np.repeat(seen[None], 11, axis=0)

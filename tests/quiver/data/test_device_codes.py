@@ -27,7 +27,8 @@ def test_codes_equal_the_reference_from_tensors_and_arrays():
 def test_nothing_is_copied():
     """Two tensors of one draw share its memory, also after Dr.Jit has released it."""
     drawn = SENSOR.sample_on_device(light(SENSOR, (2, 9, 13)), EXPOSURE, key=KEY)
-    first, second = torch.from_dlpack(drawn), torch.from_dlpack(drawn)
+    first = torch.from_dlpack(drawn)
+    second = torch.from_dlpack(drawn)
     assert first.data_ptr() == second.data_ptr()
     before = second.clone()
     del drawn

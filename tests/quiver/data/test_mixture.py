@@ -67,7 +67,8 @@ def test_two_sensors_among_the_streams_are_kept_apart(data, tmp_path):
     assert lines(data, tmp_path / "r", sensor="quiver-physical")[0].startswith(
         "noise: quiver-physical, 3 bits, 3.25 PPP (as"
     )
-    clips, two = open_clips(data), ["spad-320x240", "quiver-physical"]
+    clips = open_clips(data)
+    two = ["spad-320x240", "quiver-physical"]
     assert set(choose(clips, two).noises) == set(choose(clips).noises)
     assert len(choose(clips, two, bits=[1], ppp=[1.0]).noises) == 2  # the SPAD has its map
 
@@ -103,8 +104,10 @@ def test_every_window_is_normalised_by_its_own_sensor(make_clip: ClipMaker):
     data = Windows([make_clip()], WindowSettings(crop=16, lights=lights, flips=False, reverse=False))
     seen = set()
     for n in range(12):
-        sample, place = data[n], data.place(n)
-        light, clip = lights[place.light], data.clips[0]
+        sample = data[n]
+        place = data.place(n)
+        light = lights[place.light]
+        clip = data.clips[0]
         sensor = light.device(clip.exposure)
         codes = sample["codes"].numpy() * (2**light.bits - 1)
         assert np.allclose(codes, np.rint(codes), atol=1e-5)

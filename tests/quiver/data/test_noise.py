@@ -29,7 +29,8 @@ def test_lights_of_one_label_get_names_that_tell_them_apart():
     def named(*lights: Illumination) -> list[str]:
         return list(labels(lights).values())
 
-    plain, spad = Illumination(), Illumination("spad-320x240")
+    plain = Illumination()
+    spad = Illumination("spad-320x240")
     assert named(plain, Illumination(ppp=9.75)) == ["3.25 PPP, 3 bit", "9.75 PPP, 3 bit"]
     assert named(spad) == ["3.25 PPP, 3 bit"]
     assert named(plain, Noise.of(spad)) == ["3.25 PPP, 3 bit", "3.25 PPP, 3 bit, spad-320x240"]

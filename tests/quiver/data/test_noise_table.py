@@ -22,7 +22,9 @@ ERROR = 4e-3  # of the largest variance: straight lines between nodes; 2.1e-3 is
 
 def any_sensor(rng: np.random.Generator) -> Sensor:
     """A sensor of any model, whose response reaches from one photon to thousands."""
-    efficiency, dark, bits = rng.uniform(0.05, 1), 10 ** rng.uniform(-1, 3), int(rng.integers(1, 9))
+    efficiency = rng.uniform(0.05, 1)
+    dark = 10 ** rng.uniform(-1, 3)
+    bits = int(rng.integers(1, 9))
     match rng.integers(4):
         case 0:
             return BinarySPAD(efficiency, dark, bits)
@@ -31,7 +33,8 @@ def any_sensor(rng: np.random.Generator) -> Sensor:
         case 2:
             return CountingSPAD(efficiency, dark, EXPOSURE * 10 ** rng.uniform(-2, -0.5), min(bits, 4), True)
         case _:
-            noise, gain = float(rng.choice([0.0, rng.uniform(0, 4)])), 10 ** rng.uniform(-1.3, 1)
+            noise = float(rng.choice([0.0, rng.uniform(0, 4)]))
+            gain = 10 ** rng.uniform(-1.3, 1)
             return QIS(efficiency, dark, noise, bits, gain, offset=float(rng.choice([0.0, rng.uniform(-1, 0.4)])))
 
 
@@ -47,7 +50,8 @@ def check(sensor: Sensor, rng: np.random.Generator, draws: int) -> None:
     """At random lights up to the end of the rise: within ERROR of the exact law; drawn codes have this variance."""
     most = float(sensor.response(EXPOSURE).photons[-1])
     photons = most * rng.uniform(0, 1, 24) ** 3
-    mean, variance = sensor.mean(photons, EXPOSURE), sensor.variance(photons, EXPOSURE)
+    mean = sensor.mean(photons, EXPOSURE)
+    variance = sensor.variance(photons, EXPOSURE)
     largest = sensor.response(EXPOSURE).variance.max()
     assert np.abs(read(sensor, mean) - variance).max() < ERROR * largest, sensor
     for i in np.flatnonzero(variance > 0.1 * largest)[:draws]:
@@ -72,7 +76,8 @@ def test_many_random_sensors_have_the_noise_of_their_table():
 
 def test_beyond_the_response_the_ends_count():
     """A hot sensor in the dark, and a counter whose mean code falls again before its top code."""
-    hot, falling = QIS(0.8, 1e4, 0.2, 3), SENSORS["paralyzable"]
+    hot = QIS(0.8, 1e4, 0.2, 3)
+    falling = SENSORS["paralyzable"]
     dark = hot.variance(np.zeros(1), EXPOSURE)[0] / 49
     assert noise_table(hot, EXPOSURE)[:100] == pytest.approx(dark, rel=1e-5)
     end = falling.response(EXPOSURE)
@@ -83,7 +88,8 @@ def test_beyond_the_response_the_ends_count():
 
 def test_the_map_of_flat_light_is_the_deviation_of_its_codes():
     """Five bits: the mean of 25 codes estimates the mean, so maps lie around the exact deviation."""
-    sensor, light = QIS(0.8, 1.6, 0.2, 5, gain=0.8), 12.0
+    sensor = QIS(0.8, 1.6, 0.2, 5, gain=0.8)
+    light = 12.0
     codes = sensor.sample(np.full((64, 64), light), EXPOSURE, key=Key(1, 0), engine="reference") / 31
     frames = torch.from_numpy(codes)[None, None, None]
     found = deviation_map(frames, table_of(torch.tensor(noise_table(sensor, EXPOSURE)), frames))[..., 2:-2, 2:-2]

@@ -53,7 +53,9 @@ def test_a_damaged_file_of_counts_is_one_line(tmp_path, name):
     counts = np.random.default_rng(12).poisson(3.0, (6, 5, 4)).astype(np.uint16)
     path = tmp_path / name
     np.savez_compressed(path, counts) if name.endswith("npz") else np.save(path, counts)
-    good, rng, refused = path.read_bytes(), np.random.default_rng(13), 0
+    good = path.read_bytes()
+    rng = np.random.default_rng(13)
+    refused = 0
     cases = [b"", b"PK\3\4", b"PK\5\6" + bytes(18), b"\x93NUMPY", good[:1]]
     for _ in range(250):
         content = bytearray(good[: rng.integers(1, len(good) + 1)] if rng.random() < 0.4 else good)

@@ -51,7 +51,8 @@ def test_plane_counts_that_no_code_sums_are_refused(tmp_path, capsys):
         with pytest.raises(ValueError, match=rf"got {planes}; use ") as caught:
             plane_bits(planes)
         near = [int(word) for word in str(caught.value).rsplit("use ", 1)[1].split(" or ")]
-        below, above = max(v for v in VALID if v < planes), min((v for v in VALID if v > planes), default=None)
+        below = max(v for v in VALID if v < planes)
+        above = min((v for v in VALID if v > planes), default=None)
         assert near == [v for v in (below, above) if v is not None]
     path = packed(np.ones((10, 4, 8), np.uint8), tmp_path / "c.npy")
     words = ["restore", path, "--width", 8, "--planes", 5, "--sensor", "spad-320x240", "--method", "naive"]

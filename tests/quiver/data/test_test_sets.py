@@ -16,7 +16,8 @@ from quiver.cli.program import main
 from quiver.data import test_sets
 from quiver.data.test_sets import TEST_SETS, counted, grey, import_test_set, resized
 
-I2, X4K = TEST_SETS["quiver-published"], TEST_SETS["x4k1000fps"]
+I2 = TEST_SETS["quiver-published"]
+X4K = TEST_SETS["x4k1000fps"]
 
 
 def moving(frames: int, height: int, width: int, seed: int) -> Array:
@@ -79,7 +80,8 @@ def test_a_change_of_size_is_bicubic_without_antialiasing():
         slow = np.zeros((oh, ow))
         for i in range(oh):
             for j in range(ow):
-                y, x = (i + 0.5) * h / oh - 0.5, (j + 0.5) * w / ow - 0.5
+                y = (i + 0.5) * h / oh - 0.5
+                x = (j + 0.5) * w / ow - 0.5
                 for m in range(int(np.floor(y)) - 1, int(np.floor(y)) + 3):
                     for n in range(int(np.floor(x)) - 1, int(np.floor(x)) + 3):
                         value = float(frame[min(max(m, 0), h - 1), min(max(n, 0), w - 1)])
@@ -139,7 +141,8 @@ def test_folders_that_hold_no_window_are_refused(tmp_path, lengths, message):
 
 def test_nothing_is_written_unless_every_recording_fits(tmp_path):
     """The last one is too short, or its place holds another clip."""
-    folder, out = i2(tmp_path / "test", (12, 11, 10)), tmp_path / "out"
+    folder = i2(tmp_path / "test", (12, 11, 10))
+    out = tmp_path / "out"
     with pytest.raises(ValueError, match=r"test_00002\.mp4: 10 frames; a published window has 11"):
         import_test_set(folder, I2, out)
     assert not out.exists()
@@ -236,7 +239,9 @@ def test_clips_of_another_folder_are_not_scored_along(tmp_path, ending):
 def test_a_recording_that_was_replaced_is_not_taken_for_its_clip(tmp_path):
     """Neither a video nor one picture of a folder."""
     small = replace(X4K, size=lambda height, width: (16, 32))
-    videos, pictures, out = i2(tmp_path / "videos", (11,)), x4k(tmp_path / "pictures", 1, frames=11), tmp_path / "out"
+    videos = i2(tmp_path / "videos", (11,))
+    pictures = x4k(tmp_path / "pictures", 1, frames=11)
+    out = tmp_path / "out"
     import_test_set(videos, I2, out / "i2")
     import_test_set(pictures, small, out / "x4k")
     write_video(videos / "test_00000.mp4", iter(moving(11, 32, 48, 7)), 30, lossless=True)
@@ -248,7 +253,9 @@ def test_a_recording_that_was_replaced_is_not_taken_for_its_clip(tmp_path):
 
 
 def test_an_interrupted_import_is_not_finished_with_another_recording(tmp_path, monkeypatch):
-    folder, out, done = i2(tmp_path / "test", (11,)), tmp_path / "out", []
+    folder = i2(tmp_path / "test", (11,))
+    out = tmp_path / "out"
+    done = []
 
     def interrupted(frame: Array, size: tuple[int, int]) -> Array:
         done.append(frame)
@@ -279,7 +286,8 @@ def test_a_folder_that_is_none_is_told(tmp_path, name, capsys):
 
 def test_the_command_scores_windows_as_published(tmp_path, capsys):
     """A method that returns the mean light: its factor per window is right, its raw score is that of its brightness."""
-    folder, out = i2(tmp_path / "test", (13, 11)), tmp_path / "table"
+    folder = i2(tmp_path / "test", (13, 11))
+    out = tmp_path / "table"
     words = ["evaluate", str(folder), "-o", str(out), "--protocol", "quiver-published", "--methods", "moment:11"]
     assert main([*words, "--ppp", "3.25,26"]) == 0
     shown = capsys.readouterr()
@@ -299,7 +307,8 @@ def test_the_command_scores_windows_as_published(tmp_path, capsys):
 
 
 def test_the_table_says_what_was_scored(tmp_path):
-    folder, out = i2(tmp_path / "test", (13, 11), (16, 16)), tmp_path / "table"
+    folder = i2(tmp_path / "test", (13, 11), (16, 16))
+    out = tmp_path / "table"
     assert main(evaluation(folder, out)) == 0
     scored = f"2 clips, 4 windows; the published set has 31 clips and 6017 windows; read from {folder}"
     text = (out / "evaluation.md").read_text()
@@ -310,7 +319,8 @@ def test_the_table_says_what_was_scored(tmp_path):
 
 def test_force_keeps_what_was_not_imported(tmp_path, capsys):
     """Nothing goes before the test set was read; a file among the clips stays, and so does a set in their place."""
-    folder, out = i2(tmp_path / "test", (11,), (16, 16)), tmp_path / "table"
+    folder = i2(tmp_path / "test", (11,), (16, 16))
+    out = tmp_path / "table"
     words = evaluation(folder, out)
     assert main(words) == 0
     before = (out / "rows.jsonl").read_bytes()
@@ -333,7 +343,8 @@ def test_force_keeps_what_was_not_imported(tmp_path, capsys):
 
 
 def test_force_begins_an_interrupted_import_again(tmp_path):
-    folder, out = i2(tmp_path / "test", (11,), (16, 16)), tmp_path / "table"
+    folder = i2(tmp_path / "test", (11,), (16, 16))
+    out = tmp_path / "table"
     import_test_set(i2(tmp_path / "wrong", (12, 12), (16, 16)), I2, out / "clips")
     assert main(evaluation(folder, out)) == 2
     assert main([*evaluation(folder, out), "--force"]) == 0
@@ -342,7 +353,8 @@ def test_force_begins_an_interrupted_import_again(tmp_path):
 
 @pytest.mark.slow
 def test_the_command_scores_x4k_at_its_size(tmp_path, capsys):
-    folder, out = x4k(tmp_path / "test", 1, frames=12, size=(54, 102)), tmp_path / "table"
+    folder = x4k(tmp_path / "test", 1, frames=12, size=(54, 102))
+    out = tmp_path / "table"
     assert main(["evaluate", str(folder), "-o", str(out), "--protocol", "x4k1000fps", "--methods", "naive:11"]) == 0
     assert "1 clips, 2 windows" in capsys.readouterr().err
     found = json.loads((out / "clips" / "Type1_TEST01_000_f0433" / "clip.json").read_text())

@@ -56,7 +56,8 @@ def test_a_window_is_the_crop_of_the_sensed_frames(make_clip: ClipMaker, tmp_pat
     A sum of planes without afterpulses and crosstalk is drawn from other numbers than by `qsim sense`; the next test
     compares its distribution.
     """
-    rng, clip = random.Random(cases), make_clip(frames=16, height=20, width=26)
+    rng = random.Random(cases)
+    clip = make_clip(frames=16, height=20, width=26)
     for number in range(cases):
         model, bits = rng.choice([(SPAD, 1), (SPAD, 2), (QIS, 3), (COUNTER, 3)])
         found = random_defects(rng, model is QIS, model is SPAD)
@@ -96,9 +97,11 @@ def test_sums_of_planes_have_the_distribution_of_their_pixels(make_clip: ClipMak
     file = sensor_file(tmp_path, SPAD + 'gain_map = "gain.npy"\n', 3)
     clip = make_clip(radiance=np.full((14, 20, 26), 0.5), relative=True)
     data = Windows([clip], WindowSettings(crop=12, lights=(Illumination(file, 5.0, 3),), frames=11, flips=False))
-    sums, counts = np.zeros(3), np.zeros(3)
+    sums = np.zeros(3)
+    counts = np.zeros(3)
     for n in range(12):
-        codes, x = data[n]["codes"].numpy() * 7, data.place(n).x
+        codes = data[n]["codes"].numpy() * 7
+        x = data.place(n).x
         for kind in range(3):
             chosen = codes[..., (np.arange(x, x + 12) % 3) == kind]
             sums[kind], counts[kind] = sums[kind] + chosen.sum(), counts[kind] + chosen.size
@@ -131,7 +134,8 @@ def test_filled_windows_are_prepared_with_the_dark_rate_of_good_pixels(make_clip
     np.save(tmp_path / "dark.npy", dark)
     file = sensor_file(tmp_path, QIS + 'dark_map = "dark.npy"\n', 3)
     clip = make_clip(radiance=np.full((14, 20, 26), 0.5), relative=True)
-    light, seen = Illumination(file, 10.0, 3), []
+    light = Illumination(file, 10.0, 3)
+    seen = []
     data = Windows([clip], WindowSettings(crop=16, lights=(light,)), prepare=lambda codes: seen.append(codes) or {})
     data[0]
     assert seen[0].sensor == sensed(clip, light)[0].sensor
@@ -156,7 +160,8 @@ def test_a_drifting_window_keeps_its_pixels(make_clip: ClipMaker, tmp_path):
     file = sensor_file(tmp_path, SPAD + 'dead_map = "dead.npy"\ncrosstalk = 0.1\nafterpulse = 0.1\n', 1)
     clip = make_clip(radiance=np.full((30, 48, 40), 0.5), relative=True)
     settings = WindowSettings(crop=16, lights=(Illumination(file, 60.0, 1),), flips=False, drift=2)
-    data, moved = Windows([clip], settings), 0
+    data = Windows([clip], settings)
+    moved = 0
     noise = data.noise.noises[0]
     draw = noise.draw(clip)
     for n in range(30):
@@ -188,7 +193,8 @@ def test_no_defects_change_no_bit(make_clip: ClipMaker, tmp_path):
     clip = make_clip()
     file = sensor_file(tmp_path, QIS + "prnu = 0.0\n", 3)
     data = Windows([clip], WindowSettings(crop=16, lights=(Illumination(file, 3.25, 3),)))
-    place, noise = data.place(0), data.noise.noises[0]
+    place = data.place(0)
+    noise = data.noise.noises[0]
     assert noise.defects is None
     sensor = noise.draw(clip).sensor
     factor = light_level(clip, ppp=3.25).factor

@@ -37,10 +37,13 @@ def test_a_sample_is_what_the_docs_say(make_clip: ClipMaker):
     """Nothing turned: the target is the sharp photons of that place over white, and codes come from its key."""
     clip = make_clip(sharp=True)
     data = Windows([clip], WindowSettings(crop=16, flips=False, reverse=False, seed=7))
-    sample, place = data[1], data.place(1)
+    sample = data[1]
+    place = data.place(1)
     light = Illumination()
-    sensor, factor = light.device(clip.exposure), light_level(clip, ppp=3.25).factor
-    crop, times = (place.y, place.x, 16, 16), range(place.start, place.start + 11)
+    sensor = light.device(clip.exposure)
+    factor = light_level(clip, ppp=3.25).factor
+    crop = (place.y, place.x, 16, 16)
+    times = range(place.start, place.start + 11)
     sharp = np.stack([clip_photons(clip, t, factor, crop, sharp=True) for t in times])
     exposed = np.stack([clip_photons(clip, t, factor, crop) for t in times])
     np.testing.assert_allclose(sample["target"][:, 0], sharp / 8.75, rtol=1e-6)
@@ -166,7 +169,8 @@ def test_light_levels_are_mixed_and_named(make_clip: ClipMaker):
 
 def test_a_sensor_file_is_not_needed_after_sensing(make_clip: ClipMaker, tmp_path):
     """Its stream holds all that windows are drawn from."""
-    clip, file = make_clip(), Path(sensor_file(tmp_path, QIS + "prnu = 0.02\n", 3))
+    clip = make_clip()
+    file = Path(sensor_file(tmp_path, QIS + "prnu = 0.02\n", 3))
     clip.sense(file, ppp=3.0)
     expected = Windows([clip], WindowSettings(crop=16))[0]
     file.unlink()
@@ -187,7 +191,8 @@ def test_published_windows_have_their_own_exposure(make_clip: ClipMaker):
 def test_validation_windows_never_change(make_clip: ClipMaker):
     data = Windows([make_clip("a"), make_clip("b", seed=1)], WindowSettings(crop=16), fixed=True)
     assert len(data) == 2
-    one, other = data[0], data[0 + len(data)]
+    one = data[0]
+    other = data[0 + len(data)]
     assert torch.equal(one["codes"], other["codes"])
     assert (data.place(0).start, data.place(0).y, data.place(0).x) == (1, 10, 14)
 
@@ -304,7 +309,8 @@ def test_a_scene_at_rest_has_no_motion_blur(make_clip: ClipMaker, reverse):
     data = Windows([clip], WindowSettings(lights=(light,), crop=16, reverse=reverse, drift=2, still=True, seed=3))
     for n in range(6):
         sample = data[n]
-        sensor, white = light.device(clip.exposure), float(sample["white"])
+        sensor = light.device(clip.exposure)
+        white = float(sample["white"])
         found = sensor.response(clip.exposure).invert(sample["still"].mean(0)[0].numpy() * (sensor.levels - 1), 11)
         target = sample["target"][5, 0].numpy() * white
         assert np.abs(found / target - 1).max() < 6 / np.sqrt(11 * 0.5 * target.min())  # the exposed frame: 0.1

@@ -84,7 +84,9 @@ def test_windows_with_a_factor_each_are_matched_by_their_own(make_clip: ClipMake
 
 def test_the_sheet_shows_the_crops_of_its_rows(make_clip: ClipMaker, tmp_path, monkeypatch):
     """Other weights in the same folder have other crops, and a method that failed has none."""
-    clip, out, shown = make_clip(frames=3), tmp_path / "t", []
+    clip = make_clip(frames=3)
+    out = tmp_path / "t"
+    shown = []
     comparison = Comparison(str(clip.path), None)
 
     def noise(seed: int) -> Restorer:

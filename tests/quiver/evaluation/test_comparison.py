@@ -56,7 +56,8 @@ def test_a_known_truth_scores_what_it_should(tiny_dataset):
     comparison = Comparison(str(tiny_dataset))
     rows = evaluate(comparison, [oracle(tiny_dataset), oracle(tiny_dataset, 0.9)])
     assert [row.method for row in rows] == ["oracle 1", "oracle 0.9"] * 2
-    perfect, dark = rows[0].score, rows[1].score
+    perfect = rows[0].score
+    dark = rows[1].score
     assert perfect.psnr > 120
     assert dark.psnr_matched > 120
     clip = open_clips(tiny_dataset, "test")[0]
@@ -90,7 +91,8 @@ def test_an_interrupted_evaluation_goes_on(tiny_dataset, tmp_path):
             raise KeyboardInterrupt
         return np.ones(codes.shape)
 
-    comparison, out = Comparison(str(tiny_dataset)), tmp_path / "table"
+    comparison = Comparison(str(tiny_dataset))
+    out = tmp_path / "table"
     with pytest.raises(KeyboardInterrupt):
         evaluate(comparison, [method("slow", count)], out)
     with open(out / "rows.jsonl", "a") as file:
@@ -109,7 +111,8 @@ def test_an_interrupted_evaluation_goes_on(tiny_dataset, tmp_path):
 
 
 def test_rows_of_another_precision_or_cut_are_not_taken(make_clip: ClipMaker, tmp_path):
-    comparison, out = Comparison(str(make_clip(frames=4, height=12, width=16).path), None), tmp_path / "t"
+    comparison = Comparison(str(make_clip(frames=4, height=12, width=16).path), None)
+    out = tmp_path / "t"
     calls: list[str] = []
 
     def network(precision: str = "float32", cut: str = "") -> Restorer:
@@ -145,7 +148,8 @@ def test_rows_of_an_edited_sensor_file_are_not_mixed(make_clip: ClipMaker, tmp_p
     np.save(tmp_path / "gain.npy", np.full((36, 44), 1.1))
     file = sensor_file(tmp_path, QIS + 'gain_map = "gain.npy"\n', 3)
     comparison = Comparison(str(make_clip(frames=4).path), None, (Illumination(file, 3.25, None),))
-    methods, out = [restorer("moment:1")], tmp_path / "t"
+    methods = [restorer("moment:1")]
+    out = tmp_path / "t"
     rows = evaluate(comparison, methods, out)
     assert list(json.loads((out / "plan.json").read_text())["sensors_sha256"]) == [file]
     sensor_file(tmp_path, QIS + '# measured on a Monday\ngain_map = "gain.npy"\n', 3)
@@ -166,11 +170,13 @@ def test_two_sensors_at_one_light_level_are_both_scored(make_clip: ClipMaker, tm
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     noisy = QIS.replace("read_noise = 0.2", "read_noise = 0.9")
-    one, two = sensor_file(tmp_path / "a", QIS, 3), sensor_file(tmp_path / "b", noisy, 3)
+    one = sensor_file(tmp_path / "a", QIS, 3)
+    two = sensor_file(tmp_path / "b", noisy, 3)
     clip = make_clip(frames=4)
     for sensors, named in ((("quiver-physical", "spad-320x240"),) * 2, ((one, two), ("a/mine.toml", "b/mine.toml"))):
         lights = tuple(Illumination(sensor, 3.25, 3) for sensor in sensors)
-        comparison, out = Comparison(str(clip.path), None, lights), tmp_path / Path(sensors[1]).stem
+        comparison = Comparison(str(clip.path), None, lights)
+        out = tmp_path / Path(sensors[1]).stem
         rows = evaluate(comparison, [restorer("moment")], out)
         assert [row.light for row in rows] == [f"3.25 PPP, 3 bit, {name}" for name in named]
         assert rows[0].score != rows[1].score
@@ -186,7 +192,8 @@ def test_an_evaluation_of_other_codes_or_another_truth_is_not_continued(make_cli
     """Rows of a stream that was sensed again, or of a clip that was made again, are not mixed with new ones."""
     clip = make_clip(frames=4, height=12, width=16)
     sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, name="s"))
-    comparison, methods = Comparison(str(clip.path), stream="s"), [method("ones", lambda codes: np.ones(codes.shape))]
+    comparison = Comparison(str(clip.path), stream="s")
+    methods = [method("ones", lambda codes: np.ones(codes.shape))]
     evaluate(comparison, methods, tmp_path / "t")
     before = (tmp_path / "t" / "rows.jsonl").read_bytes()
     evaluate(comparison, methods, tmp_path / "t")
@@ -202,7 +209,8 @@ def test_an_evaluation_of_other_codes_or_another_truth_is_not_continued(make_cli
 
 
 def test_a_failure_keeps_its_row_and_reason(tiny_dataset, tmp_path):
-    comparison, methods = Comparison(str(tiny_dataset)), [method("broken", broken), restorer("moment:1")]
+    comparison = Comparison(str(tiny_dataset))
+    methods = [method("broken", broken), restorer("moment:1")]
     rows = evaluate(comparison, methods, tmp_path / "t")
     assert [row.failure for row in rows[:2]] == ["RuntimeError: no road leads there", None]
     summary.write(tmp_path / "t", comparison, methods, rows)
@@ -333,7 +341,8 @@ def test_published_crops_show_the_codes_that_methods_saw(make_clip: ClipMaker, t
         seen.append(codes.read(5, 6)[0])
         return codes.read(0, codes.shape[0]).astype(np.float32)
 
-    clip, out = make_clip(), tmp_path / "table"
+    clip = make_clip()
+    out = tmp_path / "table"
     row = evaluate(Comparison(str(clip.path), None, published=True), [method("look", look)], out)[0]
     assert row.failure is None
     frames = scored_frames(len(clip), True)

@@ -63,7 +63,8 @@ def test_weights_of_a_folder_have_the_modes_of_their_network(tmp_path):
     for name, network in (("u", UNet(UNetConfig(2))), ("q", QUIVER(SMALL))):
         (tmp_path / name).mkdir()
         save(network, network.config, tmp_path / name / "best.safetensors")
-    unet, quiver = str(tmp_path / "u"), str(tmp_path / "q")
+    unet = str(tmp_path / "u")
+    quiver = str(tmp_path / "q")
     cases = checked_cases((unet, quiver, "moment"), None, None, "cpu")
     assert [(case.method, case.mode) for case in cases] == [
         *((unet, "exact"), (quiver, "exact"), (quiver, "streaming"), ("moment", "exact"))

@@ -86,7 +86,8 @@ def cells_without_measuring(monkeypatch: pytest.MonkeyPatch) -> list[Illuminatio
 
 def test_cells_of_another_mode_precision_or_cut_are_not_taken(tiny_dataset, tmp_path, monkeypatch):
     """Cells that record none are those of the usual mode and precision."""
-    path, asked = tmp_path / "small.safetensors", cells_without_measuring(monkeypatch)
+    path = tmp_path / "small.safetensors"
+    asked = cells_without_measuring(monkeypatch)
     save(QUIVER(SMALL), SMALL, path)
     settings = DomainSettings(domain_measurement.clips_of([tiny_dataset], "test"), (Illumination(),), ("naive",))
     usual = RestoreOptions(device="cpu")
@@ -117,8 +118,10 @@ def test_cells_of_another_mode_precision_or_cut_are_not_taken(tiny_dataset, tmp_
 
 
 def test_cells_of_an_edited_sensor_file_are_not_taken(tiny_dataset, tmp_path, monkeypatch):
-    path, asked = weights(tmp_path), cells_without_measuring(monkeypatch)
-    light, usual = Illumination(sensor_file(tmp_path, QIS, 3), 3.25, 3), RestoreOptions(device="cpu")
+    path = weights(tmp_path)
+    asked = cells_without_measuring(monkeypatch)
+    light = Illumination(sensor_file(tmp_path, QIS, 3), 3.25, 3)
+    usual = RestoreOptions(device="cpu")
     settings = DomainSettings(domain_measurement.clips_of([tiny_dataset], "test"), (light,), ("naive",))
     domain_measurement.measure(path, settings, usual)
     named = replace(settings, lights=(Illumination(),))

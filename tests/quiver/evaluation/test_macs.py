@@ -47,7 +47,8 @@ def test_layers_cost_what_they_cost_by_hand():
 
 def test_a_network_costs_what_its_layers_cost():
     """By hand from the tables of layers: of a block of FastDVDnet, and of a student."""
-    w, each = 4, 3
+    w = 4
+    each = 3
     full = 9 * (3 * 2 * each + 3 * each * w + w * w + w)
     half = 9 * (w * 2 * w + 2 * (2 * w) ** 2 + 2 * (2 * w) ** 2 + 2 * w * 4 * w)
     quarter = 9 * (2 * w * 4 * w + 4 * (4 * w) ** 2 + 4 * w * 8 * w)

@@ -38,7 +38,8 @@ def ssim_by_definition(a: np.ndarray, b: np.ndarray, keep: np.ndarray) -> float:
         window = (slice(y, y + 7), slice(x, x + 7))
         if keep[window].all():
             (var_a, both), (_, var_b) = np.cov(a[window].ravel(), b[window].ravel())
-            mean_a, mean_b = a[window].mean(), b[window].mean()
+            mean_a = a[window].mean()
+            mean_b = b[window].mean()
             light = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
             found.append(light * (2 * both + 9e-4) / (var_a + var_b + 9e-4))
     return float(np.mean(found)) if found else math.nan
@@ -164,7 +165,8 @@ def test_invalid_pixels_count_nowhere():
     valid[0, :, 12:] = False
     valid[2] = False
     found = metrics.score(output, target, valid=valid)
-    spoilt, other = np.where(valid, output, 40.0), np.where(valid, target, 7.0)
+    spoilt = np.where(valid, output, 40.0)
+    other = np.where(valid, target, 7.0)
     assert metrics.score(spoilt, other, valid=valid) == found
     assert found.frames == 2
     left = metrics.psnr(output[:1, :, :12], target[:1, :, :12])
@@ -183,7 +185,8 @@ def test_a_black_output_gets_the_factor_one(output: float):
 def test_one_factor_per_frame_follows_a_flicker_that_one_per_clip_cannot():
     target = pattern()
     flicker = target * np.array([0.6, 1.1, 1.4])[:, None, None]
-    per_clip, per_frame = metrics.score(flicker, target), metrics.score(flicker, target, per_frame_scale=True)
+    per_clip = metrics.score(flicker, target)
+    per_frame = metrics.score(flicker, target, per_frame_scale=True)
     assert per_frame.psnr_matched > 200 > 30 > per_clip.psnr_matched
     assert per_clip.scale_spread == 0.0
     assert per_frame.scale_spread == pytest.approx(np.std([1 / 0.6, 1 / 1.1, 1 / 1.4]))

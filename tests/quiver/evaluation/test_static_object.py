@@ -30,7 +30,8 @@ def static_counts(light: float, shares: Array, seed: int = 0) -> tuple[Counts, A
 def test_the_reference_takes_off_its_own_noise():
     """The error of an oracle against 19 noisy frames is noise of the reference: the rest is zero within its spread."""
     shares = np.tile([1.2, 0.9, 0.9], 10)
-    left, measured = [], []
+    left = []
+    measured = []
     for seed in range(40):
         counts, true = static_counts(5.0, shares, seed)
         estimate, variance = reference(counts, np.arange(11, 30))

@@ -136,7 +136,8 @@ def test_an_infinite_score_is_stored_as_one():
 
 def test_clips_of_several_devices_have_no_common_time():
     """Their mean was shown, beside the device and the threads of the last call."""
-    light, net = "3.25 PPP, 3 bit", method("net", lambda codes: codes)
+    light = "3.25 PPP, 3 bit"
+    net = method("net", lambda codes: codes)
     first = ComparisonRow("net", "", light, "a", "a", Score(20.0, 21.0, 0.5, 0.6, 1.0, 0.0, frames=3), 1.0, 5_000_000)
     first = replace(first, device="cuda", threads=4)
     second = replace(first, clip="b", scene="b", seconds_per_frame=3.0)
@@ -154,7 +155,8 @@ def test_clips_of_several_devices_have_no_common_time():
 
 def test_clips_without_a_scene_are_told():
     """Imported clips state none, so that each counts as a scene."""
-    net, score = method("net", lambda codes: codes), Score(20.0, 21.0, 0.5, 0.6, 1.0, 0.0, frames=3)
+    net = method("net", lambda codes: codes)
+    score = Score(20.0, 21.0, 0.5, 0.6, 1.0, 0.0, frames=3)
     row = ComparisonRow("net", "", "3.25 PPP, 3 bit", "a", "a", score)
     alone = summary.markdown(Comparison("data"), [net], [row, replace(row, clip="b", scene="b")])
     assert "(clips of one scene averaged first; clips that state no scene count as one each)" in alone

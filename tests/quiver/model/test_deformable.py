@@ -21,8 +21,10 @@ def bilinear(image: np.ndarray, y: float, x: float, padding: str = "zeros") -> f
     """Return one bilinear sample of [H, W], neighbour by neighbour."""
     height, width = image.shape
     if padding == "border":
-        y, x = min(max(y, 0), height - 1), min(max(x, 0), width - 1)
-    top, left = int(np.floor(y)), int(np.floor(x))
+        y = min(max(y, 0), height - 1)
+        x = min(max(x, 0), width - 1)
+    top = int(np.floor(y))
+    left = int(np.floor(x))
     total = 0.0
     for i, j in product((top, top + 1), (left, left + 1)):
         if 0 <= i < height and 0 <= j < width:
@@ -34,7 +36,8 @@ def slow_deform(image, offset, weight, bias, mask, stride=1, padding=0, dilation
     """Return the convolution by its definition, sample by sample."""
     count, channels = image.shape[:2]
     out, fan, kh, kw = weight.shape
-    taps, groups = kh * kw, channels // fan
+    taps = kh * kw
+    groups = channels // fan
     offset_groups = offset.shape[1] // (2 * taps)
     result = np.tile(bias[None, :, None, None], (count, 1, *offset.shape[2:]))
     for n, co, i, j in np.ndindex(*result.shape):
@@ -51,10 +54,12 @@ def slow_deform(image, offset, weight, bias, mask, stride=1, padding=0, dilation
 
 @pytest.mark.parametrize("padding", ["zeros", "border"])
 def test_warp_equals_a_slow_loop(padding):
-    image, flow = draw(2, 3, *SIZE), 4 * draw(2, 2, *SIZE, seed=1)
+    image = draw(2, 3, *SIZE)
+    flow = 4 * draw(2, 2, *SIZE, seed=1)
     wanted = np.zeros(image.shape)
     for n, c, i, j in np.ndindex(*wanted.shape):
-        y, x = i + float(flow[n, 1, i, j]), j + float(flow[n, 0, i, j])
+        y = i + float(flow[n, 1, i, j])
+        x = j + float(flow[n, 0, i, j])
         wanted[n, c, i, j] = bilinear(image[n, c].numpy(), y, x, padding)
     np.testing.assert_allclose(warp(image, flow, padding).numpy(), wanted, atol=1e-12)
 
@@ -80,7 +85,8 @@ def test_warp_beyond_the_frame_is_zero_or_the_border(far):
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (6, 1)])
 def test_frames_one_pixel_wide(size):
-    image, none = draw(1, 2, *size), torch.zeros(1, 2, *size, dtype=torch.float64)
+    image = draw(1, 2, *size)
+    none = torch.zeros(1, 2, *size, dtype=torch.float64)
     assert torch.allclose(warp(image, none), image, atol=1e-13)
     weight = draw(3, 2, 3, 3, seed=1)
     offset = torch.zeros(1, 18, *size, dtype=torch.float64)
@@ -99,7 +105,9 @@ CASES = list(product((1, 2), (1, 2), (1, 2, 4), (0, 1, 2)))
 
 @pytest.mark.parametrize(("stride", "dilation", "groups", "padding"), CASES)
 def test_without_offsets_it_is_a_convolution(stride, dilation, groups, padding):
-    image, weight, bias = draw(2, 4, *SIZE), draw(8, 4 // groups, 3, 3, seed=1), draw(8, seed=2)
+    image = draw(2, 4, *SIZE)
+    weight = draw(8, 4 // groups, 3, 3, seed=1)
+    bias = draw(8, seed=2)
     options = {"stride": stride, "dilation": dilation, "padding": padding}
     wanted = F.conv2d(image, weight, bias, groups=groups, **options)
     offset = torch.zeros(2, 2 * 18, *wanted.shape[2:], dtype=torch.float64)
@@ -111,7 +119,8 @@ def test_without_offsets_it_is_a_convolution(stride, dilation, groups, padding):
 @pytest.mark.parametrize("shift", [(0, 1), (2, 0), (-3, 1), (0, 12), (-9, 0)])
 def test_whole_offsets_shift_the_image_also_beyond_its_border(shift):
     """Order (dy, dx): a wrong order fails here, because the shifts are not symmetric."""
-    image, weight = draw(1, 2, *SIZE), draw(2, 2, 1, 1, seed=1)
+    image = draw(1, 2, *SIZE)
+    weight = draw(2, 2, 1, 1, seed=1)
     offset = torch.tensor(shift, dtype=torch.float64).view(1, 2, 1, 1).expand(1, 2, *SIZE)
     dy, dx = shift
     wanted = torch.zeros_like(image)
@@ -128,11 +137,9 @@ def test_whole_offsets_shift_the_image_also_beyond_its_border(shift):
 @pytest.mark.parametrize(("dtype", "limit"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
 def test_deformable_convolution_equals_a_slow_loop(groups, dtype, limit):
     """Offsets of several pixels, many beyond the frame; stride 2 and dilation 2 with two convolution groups."""
-    image, weight, bias = (
-        draw(2, 4, *SIZE, dtype=dtype),
-        draw(4, 2, 3, 3, seed=1, dtype=dtype),
-        draw(4, seed=2, dtype=dtype),
-    )
+    image = draw(2, 4, *SIZE, dtype=dtype)
+    weight = draw(4, 2, 3, 3, seed=1, dtype=dtype)
+    bias = draw(4, seed=2, dtype=dtype)
     options = {"stride": 2, "padding": 1, "dilation": 2}
     offset = 3 * draw(2, groups * 18, 3, 4, seed=3, dtype=dtype)
     mask = torch.sigmoid(draw(2, groups * 9, 3, 4, seed=4, dtype=dtype))
@@ -165,7 +172,9 @@ def test_large_inputs_take_the_tap_loop_only_without_gradients(monkeypatch):
     sample = ops.sample_at
     monkeypatch.setattr(ops, "sample_at", lambda *a: drawn.append(a[1].shape[1]) or sample(*a))
     monkeypatch.setattr(ops, "TAP_LOOP_ABOVE", 100)
-    image, offset, weight = draw(1, 1, 6, 6), draw(1, 18, 6, 6), draw(1, 1, 3, 3)
+    image = draw(1, 1, 6, 6)
+    offset = draw(1, 18, 6, 6)
+    weight = draw(1, 1, 3, 3)
     with torch.no_grad():
         quick = deform_conv2d(image, offset, weight, padding=1)
     assert drawn == [6] * 9
@@ -187,7 +196,8 @@ def test_half_precision_is_sampled_in_float32():
 
 
 def test_shapes_that_do_not_fit_are_named():
-    image, weight = draw(1, 4, 6, 6), draw(4, 4, 3, 3)
+    image = draw(1, 4, 6, 6)
+    weight = draw(4, 4, 3, 3)
     with pytest.raises(ValueError, match=r"flow must be \(1, 2, 6, 6\), got \(1, 2, 6, 5\)"):
         warp(image, draw(1, 2, 6, 5))
     with pytest.raises(ValueError, match=r"offset must be \[1, 2\*G\*9, \(6, 6\)\], got \(1, 17, 6, 6\)"):

@@ -81,7 +81,8 @@ def test_anything_else_is_refused_by_name(state, change, message):
 @pytest.mark.parametrize("wrap", [lambda s: s, lambda s: {"epoch": 7, "state_dict": s}], ids=["bare", "nested"])
 @pytest.mark.parametrize("prefix", ["", "module."])
 def test_a_checkpoint_is_converted(tmp_path: Path, state, wrap, prefix):
-    source, target = tmp_path / "their.pth", tmp_path / "ours.safetensors"
+    source = tmp_path / "their.pth"
+    target = tmp_path / "ours.safetensors"
     torch.save(wrap({prefix + name: value for name, value in state.items()}), source)
     convert_weights(source, target)
     ours = load(target)
@@ -93,14 +94,16 @@ def test_a_checkpoint_is_converted(tmp_path: Path, state, wrap, prefix):
 
 
 def test_the_prefix_of_several_devices_is_removed_from_any_kind_of_file(tmp_path: Path, state):
-    source, target = tmp_path / "their.safetensors", tmp_path / "ours.safetensors"
+    source = tmp_path / "their.safetensors"
+    target = tmp_path / "ours.safetensors"
     save_file({f"module.{name}": value for name, value in state.items() if not ALIAS.match(name)}, source)
     convert_weights(source, target)
     assert torch.equal(load(target).alignment.weight, state["pa_deform.weight"])
 
 
 def test_a_checkpoint_in_float64_becomes_float32(tmp_path: Path, state):
-    source, target = tmp_path / "their.pth", tmp_path / "ours.safetensors"
+    source = tmp_path / "their.pth"
+    target = tmp_path / "ours.safetensors"
     torch.save({name: value.double() for name, value in state.items()}, source)
     convert_weights(source, target)
     ours = load(target).state_dict()

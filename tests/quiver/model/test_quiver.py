@@ -78,7 +78,9 @@ def test_alignment_starts_from_the_flow_alone():
     """With offsets of zero and masks of one half the result is half a convolution of the image moved by the flow."""
     torch.manual_seed(0)
     alignment = QUIVER(SMALL).double().alignment
-    previous, current, flow = draw(1, 4, 8, 8), draw(1, 4, 8, 8, seed=1), torch.zeros(1, 2, 8, 8, dtype=torch.float64)
+    previous = draw(1, 4, 8, 8)
+    current = draw(1, 4, 8, 8, seed=1)
+    flow = torch.zeros(1, 2, 8, 8, dtype=torch.float64)
     moved = torch.nn.functional.pad(previous[..., 1:], (0, 1))
     wanted = torch.nn.functional.conv2d(previous, alignment.weight / 2, padding=1)
     assert torch.allclose(alignment(previous, current, flow), wanted)
@@ -90,7 +92,8 @@ def test_alignment_starts_from_the_flow_alone():
 
 def test_inference_in_small_pieces_gives_the_same_numbers(monkeypatch):
     """Frames and taps are computed one by one, as for frames that are too large."""
-    network, x = lively(SMALL), draw(2, 12, 1, 16, 16)
+    network = lively(SMALL)
+    x = draw(2, 12, 1, 16, 16)
     with_gradients = network(x).scale1.detach()
     monkeypatch.setattr(model_module, "CHUNK_PIXELS", 1)
     monkeypatch.setattr(deformable, "TAP_LOOP_ABOVE", 1)
@@ -99,7 +102,8 @@ def test_inference_in_small_pieces_gives_the_same_numbers(monkeypatch):
 
 
 def test_clips_of_a_batch_do_not_see_each_other():
-    network, x = lively(SMALL), draw(2, 11, 1, 16, 16)
+    network = lively(SMALL)
+    x = draw(2, 11, 1, 16, 16)
     with torch.no_grad():
         assert torch.allclose(network(x).scale1[1:], network(x[1:]).scale1, atol=1e-12)
 
@@ -131,7 +135,8 @@ def test_outputs_and_gradients_are_finite(kind):
 
 
 def test_one_bright_pixel_is_seen():
-    inputs, network = hard_inputs(), lively(SMALL, torch.float32)
+    inputs = hard_inputs()
+    network = lively(SMALL, torch.float32)
     with torch.no_grad():
         dark, bright = (network(inputs[kind]).scale1[0, 0, 0] for kind in ("all zero", "one bright pixel"))
     assert float((bright - dark).abs().max()) > 1e-3
@@ -162,12 +167,14 @@ def test_the_smallest_frames():
 @pytest.mark.parametrize(("dtype", "promised"), [(torch.bfloat16, 0.04), (torch.float16, 0.005)])
 def test_half_precision_has_the_stated_error(dtype, promised):
     """RMS difference to float32 over the standard deviation, at width 16, for every output."""
-    network16, x = network(16, torch.float32), draw(1, 11, 1, 16, 16, dtype=torch.float32)
+    network16 = network(16, torch.float32)
+    x = draw(1, 11, 1, 16, 16, dtype=torch.float32)
     with torch.no_grad():
         full = network16(x)
         with torch.autocast("cpu", dtype):
             half = network16(x)
     for key in ("denoised", "flow", "scale4", "scale2", "scale1"):
-        a, b = getattr(full, key), getattr(half, key).float()
+        a = getattr(full, key)
+        b = getattr(half, key).float()
         error = float((a - b).square().mean().sqrt() / a.std())
         assert 0 < error < promised, (key, error)

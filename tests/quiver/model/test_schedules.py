@@ -20,14 +20,16 @@ def run(schedule: Callable[[QUIVER, Iterable[Tensor]], Iterator[Tensor]], networ
 
 
 def test_exact_reuse_equals_windows_from_scratch():
-    network, x = lively(TINY), draw(2, 15, 1, 16, 24)
+    network = lively(TINY)
+    x = draw(2, 15, 1, 16, 24)
     windows = run(schedules.windows, network, x)
     assert windows.shape == (2, 5, 1, 16, 24)
     assert float((run(schedules.exact, network, x) - windows).abs().max()) < 1e-10 * float(windows.std())
 
 
 def test_streaming_equals_one_pass_over_the_clip():
-    network, x = lively(TINY), draw(2, 15, 1, 16, 24)
+    network = lively(TINY)
+    x = draw(2, 15, 1, 16, 24)
     with torch.no_grad():
         whole = network(x).scale1
     assert float((run(schedules.stream, network, x) - whole).abs().max()) < 1e-10 * float(whole.std())
@@ -35,7 +37,8 @@ def test_streaming_equals_one_pass_over_the_clip():
 
 @pytest.mark.slow
 def test_the_published_network_runs_by_every_schedule():
-    network, x = lively(Config(16)), draw(1, 13, 1, 8, 12)
+    network = lively(Config(16))
+    x = draw(1, 13, 1, 8, 12)
     with torch.no_grad():
         whole = network(x).scale1
     windows = run(schedules.windows, network, x)
@@ -45,8 +48,10 @@ def test_the_published_network_runs_by_every_schedule():
 
 def test_streaming_is_not_the_same_as_windows():
     """The kept state and the missing zeros make a difference, which is not large."""
-    network, x = lively(TINY), draw(1, 16, 1, 16, 24)
-    windows, stream = run(schedules.windows, network, x), run(schedules.stream, network, x)
+    network = lively(TINY)
+    x = draw(1, 16, 1, 16, 24)
+    windows = run(schedules.windows, network, x)
+    stream = run(schedules.stream, network, x)
     difference = (windows - stream).square().mean().sqrt() / windows.std()
     assert 1e-6 < float(difference) < 0.5
 
@@ -54,7 +59,8 @@ def test_streaming_is_not_the_same_as_windows():
 @pytest.mark.parametrize("schedule", [schedules.exact, schedules.stream])
 def test_frames_are_taken_one_by_one_and_denoised_once(schedule, monkeypatch):
     network = lively(TINY, torch.float32)
-    taken, denoised = [], []
+    taken = []
+    denoised = []
 
     def frames() -> Iterator[Tensor]:
         for t in range(16):
@@ -73,7 +79,8 @@ def test_frames_are_taken_one_by_one_and_denoised_once(schedule, monkeypatch):
 @pytest.mark.slow
 def test_reuse_saves_the_promised_time():
     """CPU time of one thread per restored frame, width 16, 64 x 64: exact >= 1.5 times less, streaming >= 3 times."""
-    network16, x = network(16, torch.float32), draw(1, 26, 1, 64, 64, dtype=torch.float32)
+    network16 = network(16, torch.float32)
+    x = draw(1, 26, 1, 64, 64, dtype=torch.float32)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     seconds = {}

@@ -10,7 +10,8 @@ from quiver.model.unet import UNet
 
 
 def test_a_clip_is_restored_window_by_window():
-    network, frames = SMALL["unet"](), draw(2, 7, 1, 8, 12)
+    network = SMALL["unet"]()
+    frames = draw(2, 7, 1, 8, 12)
     assert isinstance(network, UNet)
     order = reflected(-5, 17, 7)
     with torch.no_grad():
@@ -22,7 +23,8 @@ def test_a_clip_is_restored_window_by_window():
 
 
 def test_odd_sides_are_repeated_and_cut():
-    network, frames = SMALL["unet"](), draw(1, 2, 1, 7, 9)
+    network = SMALL["unet"]()
+    frames = draw(1, 2, 1, 7, 9)
     padded = torch.cat([frames, *[frames[..., -1:]] * 3], dim=-1)
     padded = torch.cat([padded, padded[..., -1:, :]], dim=-2)
     with torch.no_grad():

@@ -121,7 +121,8 @@ def test_the_shipped_weights_are_those_of_the_preset():
 
 
 def test_weights_that_do_not_fit_are_refused(tmp_path: Path):
-    network, path = QUIVER(TINY), tmp_path / "w.safetensors"
+    network = QUIVER(TINY)
+    path = tmp_path / "w.safetensors"
     with pytest.raises(ValueError, match=r"written as \.safetensors, got w\.pth"):
         save(network, TINY, tmp_path / "w.pth")
     save_file({"a": torch.ones(1)}, path)
@@ -151,7 +152,8 @@ def tiny() -> dict[str, torch.Tensor]:
 
 def refused_or_loaded(path: Path) -> bool:
     """Return whether the file is refused, and assert bounded time and memory."""
-    before, started = reset_peak(), time.process_time()
+    before = reset_peak()
+    started = time.process_time()
     try:
         load(path)
     except Exception as error:
@@ -172,7 +174,8 @@ QUICK_OR_ALL = pytest.mark.parametrize("share", [SHARE, pytest.param(1, marks=py
 @pytest.mark.parametrize("key", sorted(TINY.to_dict()))
 def test_any_value_of_any_key_of_a_configuration(tiny, tmp_path, key, share):
     """A file that is not refused loads with the same configuration."""
-    path, wanted = tmp_path / "w.safetensors", TINY.to_dict()
+    path = tmp_path / "w.safetensors"
+    wanted = TINY.to_dict()
     for value in VALUES[sorted(wanted).index(key) % share :: share]:
         config = json.dumps(wanted | {key: value})
         save_file(tiny, path, {"format": "quiver-1", "network": "QUIVER", "config": config})
@@ -184,7 +187,8 @@ def test_any_value_of_any_key_of_a_configuration(tiny, tmp_path, key, share):
 @pytest.mark.parametrize("name", [name for name in EVERY if name != "quiver"])
 def test_any_value_of_any_key_of_a_configuration_of_any_network(tmp_path, name, share):
     """As for QUIVER above."""
-    network, path = EVERY[name](), tmp_path / "w.safetensors"
+    network = EVERY[name]()
+    path = tmp_path / "w.safetensors"
     weights = {key: value.contiguous() for key, value in network.state_dict().items()}
     for key, value in list(itertools.product(network.config.to_dict(), VALUES))[::share]:
         config = network.config.to_dict() | {key: value}
@@ -224,7 +228,8 @@ def test_a_configuration_that_is_none(tmp_path, network, config):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_many_wrong_values_at_once(tiny, tmp_path, seed):
-    rng, path = random.Random(seed), tmp_path / "w.safetensors"
+    rng = random.Random(seed)
+    path = tmp_path / "w.safetensors"
     for _ in range(25):
         wanted = TINY.to_dict()
         keys = rng.sample(sorted(wanted), rng.randint(1, 4))

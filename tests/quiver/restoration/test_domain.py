@@ -30,7 +30,8 @@ def test_the_nearest_cell_is_the_nearest_in_log_light():
         lights = np.exp(rng.uniform(-2, 5, rng.integers(1, 7)))
         bits = [int(b) for b in rng.integers(1, 4, len(lights))]
         cells = tuple(cell(float(p), 1.0, bits=b, sensor="quiver-published") for p, b in zip(lights, bits, strict=True))
-        ppp, own = float(np.exp(rng.uniform(-2.5, 5.5))), int(rng.integers(1, 4))
+        ppp = float(np.exp(rng.uniform(-2.5, 5.5)))
+        own = int(rng.integers(1, 4))
         place = domain.place_of(devices.load("quiver-published", ppp=ppp, bits=own), 5e-4, ppp)
         same = [c.ppp for c in cells if c.place.bits == own]
         found = Domain(cells, {}).nearest(place)
@@ -59,7 +60,9 @@ def test_a_domain_survives_its_file():
 
 def test_a_damaged_domain_is_one_line(tmp_path):
     """Any value replaced by one of another kind, keys gone, text cut: read alike, or a `ValueError` in one line."""
-    good, rng, refused = json.loads(MEASURED.to_json()), np.random.default_rng(2), 0
+    good = json.loads(MEASURED.to_json())
+    rng = np.random.default_rng(2)
+    refused = 0
     values = [None, True, "x", -1, 0, 1e400, math.nan, [], {}, [1], 10**400, "1"]
     for _ in range(300):
         found = json.loads(json.dumps(good))
@@ -84,7 +87,8 @@ def test_a_damaged_domain_is_one_line(tmp_path):
 
 def test_notes_leave_the_tensors_alone(tmp_path):
     path = weights(tmp_path, settings={"seed": 5})
-    before, settings = tensors_digest(path), metadata_of(path)["settings"]
+    before = tensors_digest(path)
+    settings = metadata_of(path)["settings"]
     annotate(path, {domain.KEY: MEASURED.to_json()})
     assert tensors_digest(path) == before
     assert metadata_of(path)["settings"] == settings

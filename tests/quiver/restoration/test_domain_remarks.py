@@ -50,7 +50,8 @@ def test_inside_nothing_is_said_and_outside_the_better_method():
 
 def test_light_that_is_not_told_is_estimated():
     """From 12 x 256 codes at 3.25 PPP the mean is known to about 1 %, which decides the nearest cell."""
-    told, untold = stream(), stream(told=False)
+    told = stream()
+    untold = stream(told=False)
     assert untold.ppp is None
     assert light_of(told) == 3.25
     assert light_of(untold) == pytest.approx(3.25, rel=0.1)
@@ -62,10 +63,8 @@ def test_weights_without_cells_say_what_they_were_trained_on(tmp_path):
     path = weights(tmp_path, settings={"sensor": "quiver-physical", "bits": [1, 3], "ppp": [3.25, 9.75]})
     scope = domain.read_scope(path, metadata_of(path))
     assert scope.trained == tuple(Illumination("quiver-physical", p, b) for b in (1, 3) for p in (3.25, 9.75))
-    same, other = (
-        domain_remarks.remark("mine", scope, stream()),
-        domain_remarks.remark("mine", scope, stream("spad512s", 2, 1)),
-    )
+    same = domain_remarks.remark("mine", scope, stream())
+    other = domain_remarks.remark("mine", scope, stream("spad512s", 2, 1))
     assert same == (
         "mine was never measured against the classical methods; it was trained on such streams "
         "(quiver-physical, 3 bit, 3.25 PPP)"
@@ -88,7 +87,8 @@ def test_weights_without_cells_say_what_they_were_trained_on(tmp_path):
 
 
 def test_restore_warns_in_one_line_and_refuses_with_strict(capsys, tiny_dataset, tmp_path):
-    path, clip = weights(tmp_path, MEASURED), open_clips(tiny_dataset, "test")[0].path
+    path = weights(tmp_path, MEASURED)
+    clip = open_clips(tiny_dataset, "test")[0].path
     words = ("restore", clip, "-o", tmp_path / "r.npy", "--method", path, "--ppp")
     code, _, err = run(capsys, *words, 26, "--strict")
     assert code == 2
@@ -143,7 +143,8 @@ def test_restore_checks_a_bare_array_with_its_sensor(capsys, tmp_path):
 
 
 def test_evaluate_warns_in_its_table_and_refuses_with_strict(capsys, tiny_dataset, tmp_path):
-    path, out = weights(tmp_path, MEASURED), tmp_path / "table"
+    path = weights(tmp_path, MEASURED)
+    out = tmp_path / "table"
     words = ("evaluate", tiny_dataset, "-o", out, "--methods", f"naive,{path}", "--ppp", "3.25,26")
     code, _, err = run(capsys, *words, "--strict")
     assert code == 2
@@ -186,8 +187,10 @@ def nothing(codes: Codes, out: np.ndarray, first: int, progress: object) -> None
 
 
 def test_the_call_in_python_warns_and_refuses_with_strict(tmp_path, make_clip: ClipMaker):
-    path, codes = weights(tmp_path, MEASURED), stream(ppp=26.0)
-    array, known = codes.read(0, 12), {"sensor": codes.sensor, "exposure": codes.exposure}
+    path = weights(tmp_path, MEASURED)
+    codes = stream(ppp=26.0)
+    array = codes.read(0, 12)
+    known = {"sensor": codes.sensor, "exposure": codes.exposure}
     with pytest.warns(UserWarning, match="small is worse than qbp-bm3d on QIS, 3 bit"):
         found = quiver.restore(array, str(path), **known)
     assert found.shape == array.shape
@@ -210,7 +213,8 @@ def test_a_sensor_whose_codes_tell_no_light_still_has_a_remark():
 
 def test_converted_weights_have_light_up_to_a_factor(tmp_path):
     """Also where they were measured to be best; weights that were trained here have light in photons."""
-    source, path = tmp_path / "their.pth", tmp_path / "small.safetensors"
+    source = tmp_path / "their.pth"
+    path = tmp_path / "small.safetensors"
     torch.save(published_state(), source)
     convert_weights(source, path)
     clause = "restored light is right up to a factor, as the published program learns grey / 255"
@@ -244,7 +248,8 @@ def test_light_that_changes_is_told():
 
 def test_dark_counts_and_few_frames_are_told():
     """In the middle of the measured cells: the sensor makes a fifth of the light itself, or there are three frames."""
-    scope, plain = Scope(MEASURED), stream()
+    scope = Scope(MEASURED)
+    plain = stream()
     assert domain_remarks.remark("mine", scope, plain) is None
     noisy = replace(plain, sensor=plain.sensor.with_dark_rate(0.2 * 3.25 * plain.sensor.efficiency / plain.exposure))
     assert "never measured where dark counts are 20 % of the mean light" in str(
@@ -270,7 +275,8 @@ def test_dark_counts_and_few_frames_are_told():
 
 def test_each_colour_of_a_mosaic_is_judged_at_its_own_light():
     """White pixels get the light of three bands, and the pixels of every place are restored alone."""
-    only, mosaic = Domain((cell(3.25, 25.0),), {}), replace(stream(), colour=ColourFilter(MASKS["rgbw"]))
+    only = Domain((cell(3.25, 25.0),), {})
+    mosaic = replace(stream(), colour=ColourFilter(MASKS["rgbw"]))
     (said,) = said_of(only, {}, mosaic)
     assert "mine was never measured near quiver-physical, 3 bit, 9.75 PPP" in said
     assert said_of(only, {}, replace(mosaic, colour=ColourFilter(MASKS["rggb"]))) == []

@@ -58,7 +58,8 @@ def hard_streams() -> dict[str, Array]:
 
 @pytest.mark.parametrize("name", EVERY)
 def test_hard_streams_are_restored(name):
-    method, streams = method_of(name), hard_streams()
+    method = method_of(name)
+    streams = hard_streams()
     found = {kind: method.restore(stream_of(random_codes(1, 1, 1), stack)) for kind, stack in streams.items()}
     for kind, restored in found.items():
         assert restored.shape == streams[kind].shape
@@ -70,7 +71,8 @@ def test_hard_streams_are_restored(name):
 @pytest.mark.parametrize("name", EVERY)
 def test_it_looks_ahead_as_far_as_it_says(name):
     """A frame beyond the stated future changes nothing; the description of a network of clips states the future."""
-    codes, method = random_codes(40, 8, 8), method_of(name)
+    codes = random_codes(40, 8, 8)
+    method = method_of(name)
     if hasattr(tiny(name), "look_ahead"):
         assert method.description == f"a network; look-ahead {method.look_ahead} frames"
     stack = codes.read(0, 40).copy()
@@ -80,7 +82,8 @@ def test_it_looks_ahead_as_far_as_it_says(name):
 
 @pytest.mark.parametrize("name", EVERY)
 def test_a_stored_network_restores_the_same(name, tmp_path):
-    network, codes = lively(name), random_codes(3, 12, 18)
+    network = lively(name)
+    codes = random_codes(3, 12, 18)
     save(network, network.config, tmp_path / "w.safetensors")
     stored = network_restorer(tmp_path / "w.safetensors", RestoreOptions())
     np.testing.assert_array_equal(stored.restore(codes), method_of(name).restore(codes))
@@ -100,7 +103,8 @@ SLOW = ("quiver", "spk2imgnet", "rvrt")  # more than two seconds
 def test_a_frame_beyond_the_memory_is_cut_exactly_or_with_a_word(name, monkeypatch):
     """Tiles change nothing, or a warning states by how much they differ and, where that is known, what avoids it."""
     monkeypatch.setattr("quiver.restoration.pieces.TILING", 0)  # a small frame would fit into it
-    network, codes = lively(name), random_codes(2, 96, 130)
+    network = lively(name)
+    codes = random_codes(2, 96, 130)
     memory = bytes_needed(network, 1, 9_000)
     assert len(cut_pieces(network, 96, 130, memory).tiles) > 1
     with warnings.catch_warnings(record=True) as caught:

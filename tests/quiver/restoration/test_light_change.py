@@ -29,12 +29,14 @@ def codes_of(light: Array, sensor: str, ppp: float, bits: int, seed: int) -> Cod
 
 def scene(rng: np.random.Generator, side: int, frames: int, speed: float) -> Array:
     """Smooth random light that slides by `speed` px/frame in a random direction, [T, H, W]."""
-    waves, angle = rng.normal(size=(6, 2)) * 0.15, rng.uniform(0, 2 * np.pi)
+    waves = rng.normal(size=(6, 2)) * 0.15
+    angle = rng.uniform(0, 2 * np.pi)
     phases = rng.uniform(0, 2 * np.pi, 6)
     y, x = np.mgrid[:side, :side]
     out = []
     for t in range(frames):
-        u, v = x + t * speed * np.cos(angle), y + t * speed * np.sin(angle)
+        u = x + t * speed * np.cos(angle)
+        v = y + t * speed * np.sin(angle)
         out.append(1.2 + sum(np.sin(a * u + b * v + c) for (a, b), c in zip(waves, phases, strict=True)) / 6)
     return np.stack(out)
 
@@ -46,11 +48,9 @@ def test_motion_and_noise_are_no_change_of_light(light, scenes):
     rng = np.random.default_rng(5)
     found = []
     for seed in range(scenes):
-        side, frames, speed = (
-            int(rng.integers(48, 112)),
-            int(rng.integers(2, 14)),
-            float(rng.choice([0, 0.5, 2, 6, 16])),
-        )
+        side = int(rng.integers(48, 112))
+        frames = int(rng.integers(2, 14))
+        speed = float(rng.choice([0, 0.5, 2, 6, 16]))
         found.append(light_change(codes_of(scene(rng, side, frames, speed), *light, seed)))
     assert max(found) < 0.08
     assert np.mean(found) < 0.005

@@ -53,7 +53,8 @@ def test_the_map_of_knowledge_falls_where_codes_tell_nothing():
 
 def test_the_level_near_saturation_is_that_of_pooled_codes():
     """Of pixels that are nearly all saturated, the mean of phi is too dark; phi of the mean code is not."""
-    sensor, photons = BinarySPAD(1.0, 0.0, 1), 4.0
+    sensor = BinarySPAD(1.0, 0.0, 1)
+    photons = 4.0
     codes = sensor.sample(np.full((11, 96, 96), photons), EXPOSURE, key=Key(0, 1), engine="reference")
     domain = information_domain(sensor, EXPOSURE)
     inputs = merge_inputs(mean_of(codes), domain)

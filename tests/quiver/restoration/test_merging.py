@@ -22,7 +22,8 @@ from quiver.restoration.networks import wrap_network
 from quiver.restoration.pieces import cut_pieces
 from quiver.restoration.restorers import restorer
 
-SENSOR, EXPOSURE = QIS(0.8, 1.6, 0.2, 3), 5e-4
+SENSOR = QIS(0.8, 1.6, 0.2, 3)
+EXPOSURE = 5e-4
 
 
 def method(memory=10**9, trained=True):

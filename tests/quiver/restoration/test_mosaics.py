@@ -30,7 +30,8 @@ def stream(tmp_path):
 
 @pytest.mark.parametrize("mask", [MASKS["rggb"], MASKS["quad"], MASKS["rgbw"], ("RGB",), ("RGW", "BGR")])
 def test_places_are_the_pixels_of_one_colour(mask):
-    rng, filters = np.random.default_rng(0), ColourFilter(mask)
+    rng = np.random.default_rng(0)
+    filters = ColourFilter(mask)
     values = rng.integers(0, 8, (2, 9, 11))
     codes = replace(array_codes(values, SENSOR, 1e-3), colour=filters, ppp=2.0)
     again = np.full(values.shape, -1)
@@ -90,9 +91,11 @@ def test_defective_pixels_are_filled_by_their_colour(stream):
 
 
 def test_commands_restore_show_score_and_check(stream, tmp_path, capsys):
-    clip, out = stream.clip.path, tmp_path / "video.npy"
+    clip = stream.clip.path
+    out = tmp_path / "video.npy"
     assert main(["restore", str(clip), "-o", str(out), "--method", "moment", "--json"]) == 0
-    video, described = np.load(out), json.loads(out.with_suffix(".json").read_text())
+    video = np.load(out)
+    described = json.loads(out.with_suffix(".json").read_text())
     np.testing.assert_array_equal(video, quiver.restore(stream, "moment"))
     assert described["shape"] == [12, 3, 17, 21]
     assert described["colour"]["mask"] == ["RG", "GB"]

@@ -66,7 +66,8 @@ def run(
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 3, 5), (8, 10, 7), (13, 33, 18)])
 def test_every_frame_of_any_size_comes_back(shape):
-    codes, model = random_codes(*shape), CentreFrame()
+    codes = random_codes(*shape)
+    model = CentreFrame()
     expected = codes.read(0, shape[0]) * (codes.white / 7)
     np.testing.assert_allclose(run(model, codes), expected, rtol=1e-6)
     assert all(seen[3] % 8 == seen[4] % 8 == 0 for seen in model.seen)
@@ -93,7 +94,8 @@ def test_a_range_of_frames_equals_that_part_of_the_whole():
 def test_modes_of_the_network():
     """Exact equals windows recomputed; streaming is another schedule; bfloat16 stays near float32."""
     torch.manual_seed(0)
-    codes, model = random_codes(4, 16, 16), QUIVER(SMALL).eval()
+    codes = random_codes(4, 16, 16)
+    model = QUIVER(SMALL).eval()
     windows = run(model, codes, RestoreOptions(mode="windows"))
     np.testing.assert_allclose(run(model, codes, RestoreOptions(mode="exact")), windows, atol=2e-4)
     assert np.isfinite(run(model, codes, RestoreOptions(mode="streaming"))).all()
@@ -104,7 +106,8 @@ def test_modes_of_the_network():
 @pytest.mark.parametrize(("mode", "ahead"), [("exact", 5), ("windows", 5), ("streaming", 7)])
 def test_the_stated_look_ahead_is_that_of_the_mode(mode, ahead):
     """The first restored frame is number 5: it needs frames up to 5 + look-ahead, and no others are read before it."""
-    model, read = QUIVER(SMALL).eval(), []
+    model = QUIVER(SMALL).eval()
+    read = []
     method = wrap_network(model, "q", "", RestoreOptions(mode=mode, device="cpu"))
 
     def frames() -> Iterator[Tensor]:
@@ -218,7 +221,8 @@ def test_light_that_no_codes_can_mean_is_told():
             picture = torch.full_like(x[:, 5:6], self.light)
             return Output(x, picture, picture, picture)
 
-    codes, cpu = replace(random_codes(6, 8, 8), ppp=0.5), RestoreOptions(device="cpu")
+    codes = replace(random_codes(6, 8, 8), ppp=0.5)
+    cpu = RestoreOptions(device="cpu")
     grown = wrap_network(Growing(1.0), "grown", "", cpu)
     for first in range(3):  # block by block, as a file is restored
         grown.restore(codes, first, first + 1)

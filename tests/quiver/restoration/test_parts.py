@@ -77,7 +77,8 @@ def complete(network: nn.Module, codes: Codes) -> Array:
 
 @pytest.mark.parametrize("frames", [1, 3, 16, 17, 50])
 def test_windows_are_those_of_the_complete_clip(frames):
-    network, codes = Means(), random_codes(frames, 5, 7)
+    network = Means()
+    codes = random_codes(frames, 5, 7)
     np.testing.assert_allclose(restored(network, codes), complete(network, codes), rtol=1e-5)
     part = part_of(network)
     assert (part.before, part.after, part.past, part.future) == (1, 2, 1, 2)
@@ -88,7 +89,8 @@ def test_windows_are_those_of_the_complete_clip(frames):
 
 def test_a_range_of_frames_is_that_of_the_complete_stream():
     """Though a recurrent network sees its past from the beginning of a part on."""
-    rng, codes = np.random.default_rng(0), random_codes(60, 4, 4)
+    rng = np.random.default_rng(0)
+    codes = random_codes(60, 4, 4)
     for network in (Means(), Sums()):
         whole = restored(network, codes)
         for _ in range(10):
@@ -99,7 +101,8 @@ def test_a_range_of_frames_is_that_of_the_complete_stream():
 
 @pytest.mark.parametrize(("frames", "computed"), [(1, 1), (24, 24), (32, 32), (33, 32 + 11), (96, 32 + 42 + 42)])
 def test_a_recurrent_network_computes_only_the_past_of_parts_again(frames, computed):
-    network, codes = Sums(), random_codes(frames, 3, 4)
+    network = Sums()
+    codes = random_codes(frames, 3, 4)
     restored(network, codes)
     assert network.computed == computed
 
@@ -107,8 +110,11 @@ def test_a_recurrent_network_computes_only_the_past_of_parts_again(frames, compu
 @pytest.mark.parametrize("name", [name for name in CLIPS if hasattr(tiny(name), "windows")])
 def test_only_the_windows_of_wanted_frames_are_computed(name, monkeypatch):
     """Frames 14 ... 18 lie in two parts; each is computed once, and as in the complete clip, bit for bit."""
-    network, codes, computed = tiny(name).eval(), random_codes(20, 9, 14), []
-    whole, windows = restored(network, codes), network.windows
+    network = tiny(name).eval()
+    codes = random_codes(20, 9, 14)
+    computed = []
+    whole = restored(network, codes)
+    windows = network.windows
 
     def counted(frames: Tensor, **known: Tensor) -> Tensor:
         computed.append(frames.shape[1] - network.frames_in + 1)
@@ -123,7 +129,8 @@ def test_only_the_windows_of_wanted_frames_are_computed(name, monkeypatch):
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 3, 5), (3, 10, 7)])
 def test_every_frame_of_any_size_is_restored(name, shape):
     """A clip shorter than a part: the result is the network's own."""
-    network, codes = tiny(name).eval(), random_codes(*shape)
+    network = tiny(name).eval()
+    codes = random_codes(*shape)
     found = restored(network, codes)
     assert np.isfinite(found).all()
     np.testing.assert_allclose(found, complete(network, codes), rtol=1e-3, atol=1e-4 * codes.white)
@@ -132,9 +139,11 @@ def test_every_frame_of_any_size_is_restored(name, shape):
 @pytest.mark.parametrize("name", ["emvd", "flornn", "fastdvdnet"])
 def test_the_noise_of_the_stream_is_that_of_its_sensor(name):
     """The same codes over the top code, of a sensor with five bits and of one with three: other noise, as stated."""
-    network, three = tiny(name).eval(), random_codes(2, 12, 16)
+    network = tiny(name).eval()
+    three = random_codes(2, 12, 16)
     five = replace(three, sensor=QIS(0.8, 1.6, 2.0, 5, gain=0.3), read=lambda a, b: three.read(a, b) * 31 // 7)
-    found, wanted = restored(network, five), complete(network, five)
+    found = restored(network, five)
+    wanted = complete(network, five)
     np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-4 * five.white)
     network.takes_variance = False
     assert np.abs(restored(network, five) - wanted).max() > 1e-3 * five.white
@@ -147,7 +156,8 @@ def test_weights_are_restored_and_scored_by_the_commands(tiny_dataset, tmp_path,
     network = tiny("emvd")
     save(network, network.config, tmp_path / "mine.safetensors")
     clip = tiny_dataset / "clips" / "test_0"
-    weights, out = str(tmp_path / "mine.safetensors"), tmp_path / "out.npy"
+    weights = str(tmp_path / "mine.safetensors")
+    out = tmp_path / "out.npy"
     assert main(["restore", str(clip), "--ppp", "3.25", "--method", weights, "-o", str(out), "-q"]) == 0
     assert np.load(out).shape == (14, 36, 44)
     described = json.loads(out.with_suffix(".json").read_text())
@@ -169,7 +179,8 @@ def test_presets_have_a_title(tmp_path):
 
 def test_only_a_tile_of_a_part_becomes_float32():
     """Frames of a part hold four times the bytes of their codes as float32; a tile is all that is needed at a time."""
-    network, codes = Means(), random_codes(24, 256, 256)
+    network = Means()
+    codes = random_codes(24, 256, 256)
     whole = restored(network, codes, None, 0, 1)
     part = part_of(network)
     method = wrap_network(network, "n", "", RestoreOptions(memory=40_000_000))
@@ -191,8 +202,10 @@ def test_a_frame_depends_on_as_many_frames_as_is_stated(name, every):
 
     Quickly the ends of what it depends on are searched by halving.
     """
-    method, codes = wrap_network(tiny(name), name, name, RestoreOptions(device="cpu")), random_codes(56, 16, 16)
-    data, frame = codes.read(0, 56), 20
+    method = wrap_network(tiny(name), name, name, RestoreOptions(device="cpu"))
+    codes = random_codes(56, 16, 16)
+    data = codes.read(0, 56)
+    frame = 20
     before = method.restore(codes, frame, frame + 1)
 
     def changes(t: int) -> bool:

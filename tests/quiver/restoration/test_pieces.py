@@ -78,7 +78,9 @@ def test_what_a_network_took_is_within_what_is_expected(path):
 
 def test_the_reach_of_the_small_unet_is_what_it_says():
     """A pixel changes: nothing farther than REACH changes, at any phase of the pooling, and something at REACH does."""
-    unet, side, seen = SmallUNet(3, 4).double().eval(), 120, []
+    unet = SmallUNet(3, 4).double().eval()
+    side = 120
+    seen = []
     frame = torch.rand(1, 3, side, side, dtype=torch.double)
     for parameter in unet.parameters():
         parameter.data.abs_()  # nothing cancels
@@ -97,7 +99,8 @@ def test_the_reach_of_the_small_unet_is_what_it_says():
 def test_a_convolutional_network_does_not_see_the_tiles():
     """The U-Net at random sizes and bounds: equal to 1e-5 of white, without a warning."""
     model = UNet(UNetConfig(4)).eval()
-    rng, cut = np.random.default_rng(0), 0
+    rng = np.random.default_rng(0)
+    cut = 0
     for seed in range(8):
         height, width = (int(n) for n in rng.integers(90, 200, 2))
         memory = bytes_needed(model, 1, int(rng.integers(9_000, 30_000)))
@@ -113,7 +116,8 @@ def test_a_convolutional_network_does_not_see_the_tiles():
 def test_no_preset_changes_its_answer_unsaid(preset):
     """Tiny frames, small bounds: equal to 1e-5 of white, or a warning that states by how much tiles differ."""
     torch.manual_seed(1)
-    model, rng = build(preset).eval(), np.random.default_rng(0)
+    model = build(preset).eval()
+    rng = np.random.default_rng(0)
     for seed in range(2):
         height, width = (int(n) for n in rng.integers(96, 130, 2))
         codes = moving(1, height, width, seed)
@@ -129,7 +133,8 @@ def test_no_preset_changes_its_answer_unsaid(preset):
 def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path, monkeypatch):
     """QUIVER averages over the frame: tiles differ. The warning states by how much, and the file how it was cut."""
     monkeypatch.setattr(pieces, "TILING", 0)  # a tiny frame would fit into it
-    path, codes = tmp_path / "w.safetensors", moving(1, 88, 104)
+    path = tmp_path / "w.safetensors"
+    codes = moving(1, 88, 104)
     network = lively(TINY, torch.float32)
     save(network, TINY, path)
     memory = bytes_needed(network, 1, 8_000)
@@ -153,7 +158,8 @@ def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path, monkeypa
 @pytest.mark.slow
 def test_threads_do_not_change_the_answer():
     """One and two threads of torch: equal to 1e-5 of white, by a network and by classical methods."""
-    codes, before = moving(2, 48, 56), torch.get_num_threads()
+    codes = moving(2, 48, 56)
+    before = torch.get_num_threads()
     try:
         for name in ("mergenet", "qbp-bm3d", "transform-denoise", "qbp"):
             found = []
@@ -172,8 +178,10 @@ def same_in_blocks(name: str, seed: int) -> None:
     """A random length, size, window and a bound down to a frame at a time: equal to 1e-5 of white."""
     rng = np.random.default_rng(seed)
     frames, height, width = int(rng.integers(4, 8)), *(int(n) for n in rng.integers(8, 24, 2))
-    codes, asked = moving(frames, height, width, seed), f"{name}:{rng.integers(1, 9)}"
-    whole, reports = restorer(asked).restore(codes), []
+    codes = moving(frames, height, width, seed)
+    asked = f"{name}:{rng.integers(1, 9)}"
+    whole = restorer(asked).restore(codes)
+    reports = []
     memory = (METHODS[name].bytes_per_pixel + 16 * int(rng.integers(1, 4))) * height * width
     found = restorer(asked, RestoreOptions(memory=memory)).restore(
         codes, progress=lambda done, total: reports.append(done)

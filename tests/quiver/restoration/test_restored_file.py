@@ -74,7 +74,8 @@ def resumed(codes: Codes, method: Restorer, path: Path) -> tuple[list[int], list
 
 
 def test_the_same_restoration_is_resumed(tmp_path, blocks_of_four):
-    codes, moment = random_codes(), restorer("moment")
+    codes = random_codes()
+    moment = restorer("moment")
     interrupted(codes, moment, tmp_path / "r.npy")
     assert resumed(codes, moment, tmp_path / "r.npy") == ([4, 8], [])
     assert sorted(file.name for file in tmp_path.iterdir()) == ["r.json", "r.npy"]
@@ -93,7 +94,9 @@ def weights(folder: Path, seed: int) -> Path:
 
 def test_weights_with_other_notes_are_the_same(tmp_path, blocks_of_four):
     """Cells are notes."""
-    codes, path, options = random_codes(), weights(tmp_path, 0), RestoreOptions(device="cpu")
+    codes = random_codes()
+    path = weights(tmp_path, 0)
+    options = RestoreOptions(device="cpu")
     network = restorer(str(path), options)
     interrupted(codes, network, tmp_path / "r.npy")
     annotate(path, {"step": "7"})
@@ -105,8 +108,11 @@ def test_weights_with_other_notes_are_the_same(tmp_path, blocks_of_four):
 )
 def test_a_restoration_of_something_else_starts_again(tmp_path, make_clip, blocks_of_four, what):
     """Each change of the answer: all blocks are restored again, and one line gives the reason."""
-    before, after = random_codes(), random_codes()
-    old, new, why = restorer("moment"), restorer("moment"), "the codes changed"
+    before = random_codes()
+    after = random_codes()
+    old = restorer("moment")
+    new = restorer("moment")
+    why = "the codes changed"
     match what:
         case "stream":
             clip = make_clip(frames=10)
@@ -133,7 +139,8 @@ def test_a_restoration_of_something_else_starts_again(tmp_path, make_clip, block
             old, new = (restorer(str(weights(tmp_path, seed)), options) for seed in (0, 1))
             why = "weights"
         case "window":
-            new, why = restorer("moment:3"), "the method"
+            new = restorer("moment:3")
+            why = "the method"
         case "precision":
             path = str(weights(tmp_path, 0))
             old, new = (restorer(path, RestoreOptions(precision=p)) for p in ("float32", "bfloat16"))
@@ -153,7 +160,8 @@ def test_a_restoration_of_something_else_starts_again(tmp_path, make_clip, block
 
 
 def test_damaged_notes_are_no_obstacle(tmp_path, blocks_of_four):
-    codes, moment = random_codes(), restorer("moment")
+    codes = random_codes()
+    moment = restorer("moment")
     for done in (None, "many"):
         interrupted(codes, moment, tmp_path / "r.npy")
         (tmp_path / "r.npy.part.json").write_text(json.dumps({"format": FORMAT, "done": done}))
@@ -168,8 +176,10 @@ def test_killed_anywhere_it_ends_whole(tmp_path, blocks_of_four, replaces, strid
     """SIGKILL before each event of the file system in turn, with or without an earlier video of this name: the same
     call ends with the same bytes, nothing is left.
     """
-    codes, moment = random_codes(), restorer("moment")
-    path, expected = tmp_path / "r.npy", restorer("moment").restore(random_codes())
+    codes = random_codes()
+    moment = restorer("moment")
+    path = tmp_path / "r.npy"
+    expected = restorer("moment").restore(random_codes())
 
     def earlier() -> None:
         if replaces:
@@ -194,7 +204,9 @@ def test_killed_anywhere_it_ends_whole(tmp_path, blocks_of_four, replaces, strid
 @pytest.mark.parametrize("said", ["CUDA out of memory. Tried to allocate 2 GiB.", "DefaultCPUAllocator: no memory"])
 def test_exhausted_memory_keeps_the_finished_blocks(tmp_path, blocks_of_four, monkeypatch, capsys, said):
     """One sentence, exit code 2; the same call with less memory resumes after the blocks on the disk."""
-    source, target, starts = array_file(tmp_path), tmp_path / "r.npy", []
+    source = array_file(tmp_path)
+    target = tmp_path / "r.npy"
+    starts = []
     fill = restorers.fill_classical
 
     def exhausted(*given: object) -> None:
@@ -228,7 +240,8 @@ def test_exhausted_memory_in_the_first_block_leaves_nothing(tmp_path):
 
 
 def test_the_device_is_stated_and_may_change(tmp_path, blocks_of_four):
-    codes, moment = random_codes(), restorer("moment")
+    codes = random_codes()
+    moment = restorer("moment")
     interrupted(codes, moment, tmp_path / "r.npy")
     assert json.loads((tmp_path / "r.npy.part.json").read_text())["device"] == "cpu"
     assert resumed(codes, replace(moment, device="cuda"), tmp_path / "r.npy") == ([4, 8], [])
@@ -237,7 +250,8 @@ def test_the_device_is_stated_and_may_change(tmp_path, blocks_of_four):
 
 
 def test_a_writer_killed_between_the_two_renames_is_finished_by_the_same_command(tmp_path, monkeypatch, capsys):
-    source, target = array_file(tmp_path), tmp_path / "r.npy"
+    source = array_file(tmp_path)
+    target = tmp_path / "r.npy"
     words = restore_words(source, target, "moment")
     assert main(words) == 0
     held = (tmp_path / "r.json").read_bytes()
@@ -258,7 +272,8 @@ def test_a_second_writer_is_refused_however_it_spells_the_name(tmp_path, monkeyp
     (tmp_path / "link").symlink_to(tmp_path / "out")
     (tmp_path / "alias.npy").symlink_to(tmp_path / "out/r.npy")
     monkeypatch.chdir(tmp_path)
-    codes, moment = random_codes(), restorer("moment")
+    codes = random_codes()
+    moment = restorer("moment")
     tried: list[str] = []
 
     def fill(codes: Codes, out: Array, first: int, progress: object) -> None:
@@ -369,7 +384,8 @@ def restore_words(source: Path, target: Path, method: str) -> list[str]:
 def test_a_disk_that_fills_up(small_disk, tmp_path, capsys, reserving):
     """A disk of every number of pages up to one that holds all: one line and nothing left, or the complete video."""
     source = array_file(tmp_path)
-    words, whole = restore_words(source, small_disk / "r.npy", "moment"), []
+    words = restore_words(source, small_disk / "r.npy", "moment")
+    whole = []
     for kilobytes in range(4, 64, 4):
         subprocess.run(["mount", "-o", f"remount,size={kilobytes}k", str(small_disk)], check=True)
         code = main(words)

@@ -107,7 +107,8 @@ def test_a_run_has_the_name_of_its_folder_from_any_folder(tmp_path, monkeypatch)
 
 
 def test_a_restored_file_says_what_it_is(tmp_path):
-    codes, path = random_codes(5, 6, 7), tmp_path / "video.npy"
+    codes = random_codes(5, 6, 7)
+    path = tmp_path / "video.npy"
     meta = restore_to_file(codes, restorer("moment"), path)
     stored = np.load(path)
     assert stored.dtype == np.float32
@@ -133,7 +134,9 @@ def test_a_failed_restoration_leaves_nothing(tmp_path):
 def test_an_interrupted_restoration_goes_on(tmp_path, monkeypatch):
     """Blocks of four frames, stopped in the third: the next call starts with frame 8 and ends with the same bytes."""
     monkeypatch.setattr(restored_file, "BLOCK_FRAMES", 4)
-    codes, moment, starts = random_codes(14, 5, 6), restorer("moment"), []
+    codes = random_codes(14, 5, 6)
+    moment = restorer("moment")
+    starts = []
 
     def fill(codes: Codes, out: Array, first: int, progress: object) -> None:
         starts.append(first)
@@ -141,7 +144,8 @@ def test_an_interrupted_restoration_goes_on(tmp_path, monkeypatch):
         if len(starts) == 3:
             raise KeyboardInterrupt
 
-    slow, path = replace(moment, fill=fill), tmp_path / "video.npy"
+    slow = replace(moment, fill=fill)
+    path = tmp_path / "video.npy"
     with pytest.raises(KeyboardInterrupt):
         restore_to_file(codes, slow, path)
     assert not path.exists()

@@ -40,7 +40,8 @@ def static_cubes(folder: Path, planes: int = 1200, size: tuple[int, int] = (6, 1
 
 def test_a_submission_holds_exactly_the_pictures(tmp_path, capsys):
     """One command: SCENE/FRAME.png of sRGB, near the light of the cubes, and their PSNR in the description."""
-    source, target = static_cubes(tmp_path / "cubes"), tmp_path / "new" / "out.zip"
+    source = static_cubes(tmp_path / "cubes")
+    target = tmp_path / "new" / "out.zip"
     words = ["restore", str(source), "-o", str(target), "--method", "moment:9", "--planes", "127"]
     assert main(words) == 0
     assert "2 pictures by moment:9, 127 planes per code, PSNR" in capsys.readouterr().out
@@ -84,7 +85,8 @@ def test_without_truth_there_is_no_score(tmp_path):
 
 
 def test_psnr_of_pictures():
-    black, grey = np.zeros((2, 3, 3), np.uint8), np.full((2, 3, 3), 51, np.uint8)
+    black = np.zeros((2, 3, 3), np.uint8)
+    grey = np.full((2, 3, 3), 51, np.uint8)
     assert picture_psnr(black, grey) == pytest.approx(20 * np.log10(5))
     assert picture_psnr(grey, grey) == 100.0
 
@@ -124,7 +126,9 @@ class Idle:
 
 def test_every_band_of_every_cube_decides(tmp_path, monkeypatch, capsys):
     """`auto`, and --strict with the remark on the last band of the last cube."""
-    source, seen, unknown = static_cubes(tmp_path / "cubes", planes=21), [], {"night/000007 blue"}
+    source = static_cubes(tmp_path / "cubes", planes=21)
+    seen = []
+    unknown = {"night/000007 blue"}
     words = ["restore", str(source), "-o", str(tmp_path / "a.zip"), "--planes", "7"]
 
     def chosen(name: str, streams: Iterable[Codes], options: object) -> tuple[Restorer, None]:

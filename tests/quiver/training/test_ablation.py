@@ -21,7 +21,8 @@ def row(light: str, psnr: float, clip: str, scene: str) -> ComparisonRow:
 
 
 def test_light_levels_have_lines_of_their_own():
-    dim, bright = row("A", 20.0, "fan", "fan"), row("B", 30.0, "fan", "fan")
+    dim = row("A", 20.0, "fan", "fan")
+    bright = row("B", 30.0, "fan", "fan")
     header, _, first, second = markdown("quiver-s", [dim, bright]).splitlines()
     assert header.split("|")[5].strip() == "light"
     assert first.endswith("| A | 20.00 dB | 0.500 |")

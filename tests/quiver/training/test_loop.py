@@ -78,7 +78,8 @@ def test_the_first_validation_saves_and_every_start_says_its_step(tiny_dataset, 
     """Killed at step 4 after a validation at step 3, it resumes after 3; killed before, it says why it starts at 0."""
 
     def killed_at(step: int) -> list[str]:
-        asked, said = [], []
+        asked = []
+        said = []
 
         def kill() -> bool:
             asked.append(1)
@@ -147,7 +148,8 @@ def test_a_run_is_replaced_only_by_one_that_can_start(tiny_dataset, tmp_path, mo
 
 @pytest.mark.slow
 def test_workers_do_not_change_the_run(tiny_dataset, tmp_path):
-    alone, helped = small_network(), small_network()
+    alone = small_network()
+    helped = small_network()
     train(alone, settings(tiny_dataset, tmp_path / "a", steps=2), progress=False)
     train(helped, settings(tiny_dataset, tmp_path / "b", steps=2, workers=1), progress=False)
     assert same_weights(alone, helped)
@@ -164,7 +166,8 @@ def test_batches_know_their_workers(tiny_dataset, tmp_path, monkeypatch):
         raise ValueError(f"{text}\nValueError: clip a: frame 3 is damaged\n")
 
     monkeypatch.setattr(training, "DataLoader", loader)
-    run, alone = settings(tiny_dataset, tmp_path / "r", workers=1), Process(0, 1, torch.device("cpu"))
+    run = settings(tiny_dataset, tmp_path / "r", workers=1)
+    alone = Process(0, 1, torch.device("cpu"))
     found = training.batches(None, run, State(), alone)  # type: ignore[arg-type]
     assert next(found) == {}
     with pytest.raises(ValueError, match=r"^clip a: frame 3 is damaged$"):
@@ -306,7 +309,8 @@ def test_clips_that_train_do_not_validate(tiny_dataset, tmp_path):
 
 def test_a_run_resumes_only_with_its_clips(tmp_path):
     """A clip that was made since would change every later sample; a data set without all its clips is named."""
-    data, said = write_dataset(tmp_path / "d", {"train": 2, "val": 1}), list[str]()
+    data = write_dataset(tmp_path / "d", {"train": 2, "val": 1})
+    said = list[str]()
     record = data / "jobs/train_1.json"
     record.rename(tmp_path / "away.json")
     once = settings(data, tmp_path / "r", steps=1)
@@ -325,7 +329,8 @@ def test_a_run_resumes_only_with_its_clips(tmp_path):
 
 def test_a_run_resumes_only_with_its_processes_and_precision(tiny_dataset, tmp_path, monkeypatch):
     """Of another number of processes or another device its samples or its rounding would change without a word."""
-    once, path = settings(tiny_dataset, tmp_path / "r", steps=1), tmp_path / "r/settings.json"
+    once = settings(tiny_dataset, tmp_path / "r", steps=1)
+    path = tmp_path / "r/settings.json"
     train(small_network(), once, progress=False)
     found = json.loads(path.read_text())
     assert (found["processes"], found["computes_in"], len(found["clips"])) == (1, "float32", 64)
@@ -342,7 +347,8 @@ def test_bfloat16_trains_with_float32_losses(tiny_dataset, tmp_path):
     """From the same samples and weights, the first losses differ by less than bfloat16's 2^-8 of them."""
     full = train(small_network(), settings(tiny_dataset, tmp_path / "a", steps=1), progress=False)
     low = train(small_network(), settings(tiny_dataset, tmp_path / "b", steps=1, precision="bfloat16"), progress=False)
-    a, b = full.history[0]["loss"], low.history[0]["loss"]
+    a = full.history[0]["loss"]
+    b = low.history[0]["loss"]
     assert a != b
     assert abs(a - b) < a * 2**-8
 
@@ -423,7 +429,8 @@ def scored(psnr: float) -> metrics.Score:
 @pytest.mark.parametrize("value", [math.inf, math.nan])
 def test_windows_without_a_finite_score_do_not_count(tiny_dataset, tmp_path, monkeypatch, value):
     """Such as black ones that are restored as black; a validation of them alone has no other score."""
-    found, network = itertools.chain((scored(value), scored(20.0)), itertools.repeat(scored(value))), small_network()
+    found = itertools.chain((scored(value), scored(20.0)), itertools.repeat(scored(value)))
+    network = small_network()
     monkeypatch.setattr(metrics, "score", lambda *images: next(found))
     windows = make_windows(settings(tiny_dataset, tmp_path / "r"), 4)[1]
     assert len(windows) == 2

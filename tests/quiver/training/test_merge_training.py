@@ -31,7 +31,8 @@ def sample(sensor, seed=0, ppp=2.0):
 
 @pytest.mark.parametrize("sensor", [QIS(0.8, 1.6, 0.2, 3), QIS(0.8, 1.6, 0.2, 7), BinarySPAD(1.0, 0.0, 5)])
 def test_the_table_is_the_inverse_of_phi(sensor):
-    domain, one = information_domain(sensor, EXPOSURE), sample(sensor)
+    domain = information_domain(sensor, EXPOSURE)
+    one = sample(sensor)
     light = np.linspace(0.02, 0.9, 50) * sensor.white(EXPOSURE)
     phi = np.interp(light, domain.photons, domain.phi)
     found = mt.light_of(torch.tensor(phi, dtype=torch.float32)[None, None], one["top"][None], one["table"][None])
@@ -62,7 +63,8 @@ def test_training_lowers_the_loss():
     torch.manual_seed(0)
     network = MergeNet(MergeNetConfig(4))
     batch = default_collate([sample(QIS(0.8, 1.6, 0.2, 3), seed) for seed in range(2)])
-    optimiser, losses = torch.optim.Adam(network.parameters(), 3e-3), []
+    optimiser = torch.optim.Adam(network.parameters(), 3e-3)
+    losses = []
     for _ in range(30):
         losses.append(mt.loss(network, batch, Settings("", "", steps=1), 0.0))
         optimiser.zero_grad()

@@ -38,7 +38,8 @@ def test_the_transforms_of_emvd_are_compared_in_float32_under_autocast(monkeypat
     monkeypatch.setattr(
         rival_losses, "_from_identity", lambda product: kinds.append(product.dtype) or product.new_zeros(())
     )
-    network, frames = tiny("emvd"), torch.rand(1, 3, 1, 16, 16)
+    network = tiny("emvd")
+    frames = torch.rand(1, 3, 1, 16, 16)
     with torch.autocast("cpu", torch.bfloat16):
         rival_losses.emvd_loss(network, {"codes": frames, "target": frames}, None, 0.0)
     assert kinds == [torch.float32] * 2

@@ -122,7 +122,8 @@ def test_a_full_disk_inside_a_checkpoint(tiny_dataset, tmp_path, monkeypatch):
 
 def test_a_disk_that_is_full_after_some_bytes_of_a_checkpoint(tmp_path):
     """The write fails halfway, at the system's limit on file sizes; the old file stays."""
-    run, network = Run(Settings("d", str(tmp_path), steps=2)), UNet(UNetConfig(4))
+    run = Run(Settings("d", str(tmp_path), steps=2))
+    network = UNet(UNetConfig(4))
     optimiser = Optimiser(network, "adam", 1e-3, (0.9, 0.99))
     run.save(run.checkpoint, network, optimiser, State())
     whole = run.checkpoint.read_bytes()
@@ -219,11 +220,13 @@ def test_any_value_at_any_place_of_a_checkpoint(tmp_path, cases):
     """
     run, content = trained(tmp_path / "r")
     assert asdict(resumed(run)) == content["state"]
-    rng, refusals = random.Random(cases), 0
+    rng = random.Random(cases)
+    refusals = 0
     spots = [(), *(spot for spot in places(content) if "param_groups" not in spot)]
     for _ in range(cases):
         torch.save(replaced(content, rng.choice(spots), rng.choice(ODD)), run.checkpoint)
-        before, started = reset_peak(), time.process_time()
+        before = reset_peak()
+        started = time.process_time()
         try:
             resumed(run)
         except Exception as error:

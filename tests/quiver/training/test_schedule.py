@@ -22,7 +22,8 @@ def test_cosine_follows_steps_or_time():
 
 def test_plateau_halves_at_the_ninth_validation_without_gain():
     """With patience 8, the ninth validation in a row without a relative gain of 1e-4 halves the rate."""
-    state, plan = State(), Settings("d", "o", steps=9, schedule="plateau", warmup=0, learning_rate=1.0)
+    state = State()
+    plan = Settings("d", "o", steps=9, schedule="plateau", warmup=0, learning_rate=1.0)
     note_plateau(8, state, 30.0)
     for _ in range(8):
         note_plateau(8, state, 30.002)

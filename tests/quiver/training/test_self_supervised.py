@@ -162,7 +162,8 @@ def test_windows_are_sent_to_workers_without_their_codes(stream):
 
 @pytest.mark.slow
 def test_workers_do_not_change_the_run(stream, tmp_path):
-    codes, networks = stream_at(stream), []
+    codes = stream_at(stream)
+    networks = []
     for workers in (0, 1):
         networks.append(small(codes))
         torch.manual_seed(5)
@@ -214,7 +215,9 @@ class Second(Process):
 def test_of_several_processes_each_splits_by_its_samples(stream, tmp_path, monkeypatch):
     """The stored random state is the leader's: a resumed process draws what it would have drawn."""
     monkeypatch.setattr(torch.nn.parallel, "DistributedDataParallel", lambda module, **options: module)
-    run, codes, losses = settings_of(stream, tmp_path / "r"), stream_at(stream), []
+    run = settings_of(stream, tmp_path / "r")
+    codes = stream_at(stream)
+    losses = []
     windows = make_stream_windows(run)
     batch = torch.utils.data.default_collate([windows[2], windows[3]])
     for seed, first in ((1, 2), (5, 2), (5, 6)):
@@ -249,7 +252,8 @@ def test_it_learns_the_light_of_its_stream(tmp_path):
 
 def test_the_command_trains_on_a_clip_and_restores_it(stream, tmp_path, capsys):
     """The clip folder, or its stream; the run is a method; options of data sets are refused."""
-    clip, run = tmp_path / "clip", tmp_path / "run"
+    clip = tmp_path / "clip"
+    run = tmp_path / "run"
     small_run = ["--steps", "1", "--crop", "16", "--frames", "8", "-q"]
     assert main(["train", str(clip), "-o", str(run), "--preset", "bit2bit", *small_run, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

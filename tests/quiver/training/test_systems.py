@@ -189,7 +189,8 @@ def test_after_a_few_steps_a_frame_depends_on_exactly_the_declared_ones(tiny_dat
     method = wrap_network(network, name, "", RestoreOptions())
     frames, t = (8, 4) if getattr(network, "look_ahead", 0) is None else (14, 6)
     codes = random_codes(frames, 16, 20)
-    before, stack = method.restore(codes, t, t + 1), codes.read(0, frames)
+    before = method.restore(codes, t, t + 1)
+    stack = codes.read(0, frames)
     past = method.window - 1 - method.look_ahead
     outermost = {t - past - 1, t - past, t, t + method.look_ahead, t + method.look_ahead + 1}
     for changed in range(frames) if every else sorted(outermost & set(range(frames))):
@@ -206,8 +207,10 @@ def test_after_a_few_steps_a_stream_depends_on_each_of_its_frames(tmp_path):
     network = tiny("bit2bit")
     sizes = {"frames": 8, "crop": 16, "batch": 1, "loss": "own", "warmup": 1}
     train(network, Settings(str(stream), str(tmp_path / "r"), "bit2bit", steps=4, **sizes), progress=False)
-    codes, method = random_codes(8, 16, 20), wrap_network(network, "bit2bit", "", RestoreOptions())
-    before, stack = method.restore(codes, 4, 5), codes.read(0, 8)
+    codes = random_codes(8, 16, 20)
+    method = wrap_network(network, "bit2bit", "", RestoreOptions())
+    before = method.restore(codes, 4, 5)
+    stack = codes.read(0, 8)
     for changed in range(8):
         other = stack.copy()
         other[changed] = 7 - other[changed]
@@ -253,14 +256,16 @@ def test_emvd_as_published_multiplies_without_transposing():
     with torch.no_grad():
         network.ft.net1["weight"][0, 0, 0, 1] += 0.5  # type: ignore[index]
     codes = torch.zeros(1, 1, 1, 16, 16)
-    batch, run = {"codes": codes, "target": network(codes).detach()}, Settings("d", "o", steps=1)
+    batch = {"codes": codes, "target": network(codes).detach()}
+    run = Settings("d", "o", steps=1)
     with torch.no_grad():
         ours = float(system_of(network).loss(network, batch, run, 1.0))
         network.config = replace(network.config, as_published=True)
         theirs = float(system_of(network).loss(network, batch, run, 1.0))
     low, high = torch.tensor([[1.0, 1.0], [1.0, -1.0]]) / 2**0.5
     analysis = torch.stack([low + torch.tensor([0.0, 0.5]), high])
-    synthesis, one = torch.stack([low, high]), torch.eye(2)
+    synthesis = torch.stack([low, high])
+    one = torch.eye(2)
     expected = [float((m - one).square().sum()) for m in (analysis.T @ synthesis, analysis @ synthesis)]
     assert ours - theirs == pytest.approx(expected[0] - expected[1], abs=1e-5)
 
@@ -393,7 +398,8 @@ def test_flornn_learns_over_more_frames_than_published():
 @pytest.mark.parametrize("name", ["emvd", "flornn", "memdeblur", "rvrt", "unet", "spk2imgnet"])
 def test_validations_of_networks_with_a_state_are_as_long_as_training(name):
     network = tiny(name)
-    system, run = system_of(network), Settings("d", "o", frames=40, steps=1)
+    system = system_of(network)
+    run = Settings("d", "o", frames=40, steps=1)
     assert system.validated(network, run) == (40 if name not in ("unet", "spk2imgnet") else system.window(network))
 
 
@@ -453,7 +459,8 @@ def moments(codes: Codes) -> dict[str, Tensor]:
 
 def test_windows_compute_inputs_from_codes_sensor_and_light(tiny_dataset):
     clips = open_clips(tiny_dataset, "train")
-    plain, more = Windows(clips, WindowSettings(crop=16)), Windows(clips, WindowSettings(crop=16), prepare=moments)
+    plain = Windows(clips, WindowSettings(crop=16))
+    more = Windows(clips, WindowSettings(crop=16), prepare=moments)
     for n in (0, 5):
         sample = more[n]
         assert set(sample) - set(plain[n]) == {"mean", "known"}
@@ -466,7 +473,8 @@ def test_samples_hold_noisy_copies_of_the_centre_frame(tiny_dataset):
     """Their mean is the sensor's for the light of the centre frame; their noise is new in each, the codes as before."""
     clips = open_clips(tiny_dataset, "train")
     windows = Windows(clips, WindowSettings(crop=32, still=True))
-    sample, plain = windows[1], Windows(clips, WindowSettings(crop=32))[1]
+    sample = windows[1]
+    plain = Windows(clips, WindowSettings(crop=32))[1]
     assert torch.equal(sample["codes"], plain["codes"])
     still = sample["still"].numpy()[:, 0] * 7
     assert not np.array_equal(still[0], still[1])

@@ -92,7 +92,8 @@ def test_a_frame_does_not_depend_on_the_frames_rendered_before():
 
 def test_frames_beyond_the_clip_are_not_used():
     made = plate(None, light=SunSky())
-    first, more = pictures(made, 0, frames=2), pictures(made, 0, frames=3)
+    first = pictures(made, 0, frames=2)
+    more = pictures(made, 0, frames=3)
     np.testing.assert_array_equal(first[1], more[1])
     np.testing.assert_array_equal(first[1], first[-1])
     assert not np.array_equal(more[1], more[2])

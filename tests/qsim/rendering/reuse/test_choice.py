@@ -85,7 +85,8 @@ def test_a_bias_that_alternates_within_a_block_is_stated():
 
 def test_the_stated_error_is_seldom_too_good():
     """By blocks it has less chance than by single pixels, and the larger of both is stated."""
-    apart, draws = [], 40
+    apart = []
+    draws = 40
     for seed in range(draws):
         truth, pictures = drawn(seed, 0.05 * np.sin(np.arange(SIZE[1]) / 9.0) * np.ones(SIZE))
         mixed = reused_mean(pictures[0], pictures[3], None, 10.0)

@@ -58,7 +58,8 @@ class Reference:
 
     def keyed(self, node: int, path: str, numbers: int, make: Callable[[int], np.ndarray]) -> None:
         """Add a channel with random keys."""
-        kind, k = str(self.rng.choice(KINDS)), int(self.rng.integers(1, 5))
+        kind = str(self.rng.choice(KINDS))
+        k = int(self.rng.integers(1, 5))
         times = f4(np.cumsum(self.rng.uniform(0.05, 0.5, k)))
         values = f4(make(k))
         stored = values
@@ -96,7 +97,8 @@ class Reference:
 
     def skinned(self, vertices: int, nodes: range) -> tuple[np.ndarray, dict[str, Any]]:
         """Return vertices, and a mesh whose triangles are three vertices in order; the skin is stored, too."""
-        rng, file = self.rng, self.file
+        rng = self.rng
+        file = self.file
         order = rng.permutation(len(nodes))
         self.bones = order[: int(rng.integers(1, len(nodes) + 1))].tolist()
         self.binds = f4([np.vstack([rng.normal(size=(3, 4)), [0, 0, 0, 1]]) for _ in self.bones])
@@ -185,7 +187,8 @@ def test_random_files_deform_as_the_reference(seed, tmp_path):
     mesh, motion = animated_file(path, size, speed=1.5, start=0.1, repeat=False)
     length = max(times[-1] for _, times, _ in reference.curves.values())
     first = reference.expected(min(0.1, length))
-    low, high = first.min(0), first.max(0)
+    low = first.min(0)
+    high = first.max(0)
     scale = 1.0 if size is None else size / (high - low).max()
     np.testing.assert_allclose(mesh.vertices, (first - (low + high) / 2) * scale, atol=SINGLE * scale * np.ptp(first))
     assert mesh.vertices.min(0) == pytest.approx(-mesh.vertices.max(0), abs=1e-6 * scale * np.ptp(first))
@@ -202,7 +205,8 @@ def test_the_arm_bends_by_its_second_joint(tmp_path):
     rest = mesh.vertices + middle
     for t in (0.0, 0.25, 0.6, 1.6, -0.4):
         a = np.pi / 2 * (max(t, 0.0) % 1.0)
-        c, s = np.cos(a), np.sin(a)
+        c = np.cos(a)
+        s = np.sin(a)
         bent = (rest - (1, 0, 0)) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + (1, 0, 0)
         share = np.where(np.isclose(rest[:, 0], 1), 0.5, rest[:, 0] > 1)[:, None]
         np.testing.assert_allclose(motion.deform(t), share * bent + (1 - share) * rest - middle, atol=1e-7)
@@ -282,7 +286,8 @@ def test_files_of_another_program_are_read_as_it_reads_them(tmp_path):
     key = base64.b64encode(np.array([0, 0, 0, 0], "<f4")).decode()
     content["buffers"].append({"byteLength": 16, "uri": f"data:;base64,{key}"})
     content["bufferViews"].append({"buffer": len(content["buffers"]) - 1, "byteLength": 16})
-    view, accessor = len(content["bufferViews"]) - 1, len(content["accessors"])
+    view = len(content["bufferViews"]) - 1
+    accessor = len(content["accessors"])
     content["accessors"] += [
         {"bufferView": view, "componentType": 5126, "count": 1, "type": "SCALAR"},
         {"bufferView": view, "componentType": 5126, "count": 1, "type": "VEC3", "byteOffset": 4},
@@ -472,12 +477,14 @@ def test_no_vertex_moves_beyond_the_bound_that_is_checked(seed, tmp_path):
     path = reference.file.write(tmp_path / "body.glb")
     if not reference.channels:
         return
-    low, high = 1.0, 1e12
+    low = 1.0
+    high = 1e12
     for _ in range(40):
         middle = float(np.sqrt(low * high))
         try:
             _, motion = animated_file(path, middle)
-            low, moved = middle, motion
+            low = middle
+            moved = motion
         except ValueError:
             high = middle
     farthest = max(np.abs(moved.deform(t)).max() for t in np.linspace(0, moved.clock.length, 301))

@@ -28,7 +28,8 @@ def test_vertices_are_weighted_sums_of_chains_of_matrices(seed):
         for _ in range(joints)
     ]
     tree = tuple(Joint(motion, int(rng.integers(-1, i)) if i else -1) for i, motion in enumerate(motions))
-    rest, owners = rng.normal(size=(count, 3)), rng.integers(0, joints, (count, wide))
+    rest = rng.normal(size=(count, 3))
+    owners = rng.integers(0, joints, (count, wide))
     shares = rng.dirichlet(np.ones(wide), count)
     first = int(rng.integers(0, count))
     shifts = rng.normal(size=(targets, int(rng.integers(1, count - first + 1)), 3))
@@ -45,7 +46,8 @@ def test_vertices_are_weighted_sums_of_chains_of_matrices(seed):
                 start += weight * shifts[m, v - first]
         total = np.zeros(3)
         for owner, share in zip(owners[v].tolist(), shares[v].tolist(), strict=True):
-            point, at = start, owner
+            point = start
+            at = owner
             while at >= 0:  # from the joint up to the root
                 pose = motions[at].pose(moment)
                 point = pose[:3, :3] @ point + pose[:3, 3]
@@ -55,15 +57,18 @@ def test_vertices_are_weighted_sums_of_chains_of_matrices(seed):
 
 
 def test_one_bone_is_a_rigid_rotation_and_the_knee_follows_the_hip():
-    hip, knee = Pendulum((0, 0, 0), (0, 0, 1), 0.7, 3.0), Pendulum((0, -0.3, 0), (0, 0, 1), 0.4, 5.0, 0.2)
+    hip = Pendulum((0, 0, 0), (0, 0, 1), 0.7, 3.0)
+    knee = Pendulum((0, -0.3, 0), (0, 0, 1), 0.4, 5.0, 0.2)
     rest = strip()
     below = np.arange(7) >= 3
     leg = Skinned(rest, (Joint(hip), Joint(knee, 0)), below[:, None], ONE, carrier=Translation((1.0, 0, 0)))
     t = 0.0713
-    a, b = 0.7 * np.sin(6 * np.pi * t), 0.4 * np.sin(10 * np.pi * t + 0.2)
+    a = 0.7 * np.sin(6 * np.pi * t)
+    b = 0.4 * np.sin(10 * np.pi * t + 0.2)
 
     def turned(points, angle):
-        c, s = np.cos(angle), np.sin(angle)
+        c = np.cos(angle)
+        s = np.sin(angle)
         return np.column_stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1], points[:, 2]])
 
     joint = np.array([0, -0.3, 0])

@@ -25,7 +25,8 @@ def test_lines_steps_and_splines_are_those_of_scipy(seed):
     rng, times, values = keys(seed, 5)
     tangents = rng.normal(size=(2, *values.shape))
     moments = np.concatenate([rng.uniform(-1, times[-1] + 1, 31), times])
-    line, step = Track(times, values), Track(times, values, "step")
+    line = Track(times, values)
+    step = Track(times, values, "step")
     curve = Track(times, values, "cubic", tangents)
     for t in moments.tolist():
         inside = float(np.clip(t, times[0], times[-1]))
@@ -45,7 +46,8 @@ def test_rotations_turn_uniformly_on_the_shorter_way(seed):
     if seed % 3 == 0:  # nearly equal, and of opposite sign
         near = quaternions[0] + 10.0 ** -rng.integers(3, 17) * quaternions[1]
         quaternions[1] = -near / np.linalg.norm(near)
-    track, reference = Track(times, quaternions), Slerp(times, Rotation.from_quat(quaternions))
+    track = Track(times, quaternions)
+    reference = Slerp(times, Rotation.from_quat(quaternions))
     for t in rng.uniform(times[0], times[-1], 31).tolist():
         np.testing.assert_allclose(rotation_of(track.quaternion_at(t)), reference(t).as_matrix(), atol=1e-12)
         assert np.linalg.norm(track.quaternion_at(t)) == pytest.approx(1, abs=1e-14)
@@ -57,7 +59,8 @@ def test_a_spline_of_rotations_has_length_one_and_a_step_does_not_turn():
     rng, times, quaternions = keys(3, 4)
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     tangents = rng.normal(size=(2, *quaternions.shape))
-    curve, step = Track(times, quaternions, "cubic", tangents), Track(times, quaternions, "step")
+    curve = Track(times, quaternions, "cubic", tangents)
+    step = Track(times, quaternions, "step")
     for t in rng.uniform(times[0], times[-1], 9).tolist():
         assert np.linalg.norm(curve.quaternion_at(t)) == pytest.approx(1)
         np.testing.assert_allclose(curve.quaternion_at(t), curve.at(t) / np.linalg.norm(curve.at(t)))
@@ -69,7 +72,9 @@ def test_a_spline_of_rotations_has_length_one_and_a_step_does_not_turn():
 @pytest.mark.parametrize("seed", DRAWS)
 def test_a_placement_scales_then_rotates_then_shifts(seed):
     rng = np.random.default_rng(seed)
-    turn, shift, scale = Rotation.random(rng=rng), rng.normal(size=3), rng.normal(size=3)
+    turn = Rotation.random(rng=rng)
+    shift = rng.normal(size=3)
+    scale = rng.normal(size=3)
     placed = Keyed(*(Track.constant(value) for value in (shift, turn.as_quat(), scale)))
     point = rng.normal(size=3)
     np.testing.assert_allclose((placed.pose(0.3) @ (*point, 1))[:3], turn.apply(scale * point) + shift, atol=1e-13)
@@ -78,7 +83,8 @@ def test_a_placement_scales_then_rotates_then_shifts(seed):
 def test_clocks_run_repeat_and_hold():
     assert Clock().at(-3.5) == -3.5
     assert Clock(2.0, 0.25).at(3.0) == 6.25
-    repeated, held = Clock(2.0, 0.25, 0.5), Clock(2.0, 0.25, 0.5, repeat=False)
+    repeated = Clock(2.0, 0.25, 0.5)
+    held = Clock(2.0, 0.25, 0.5, repeat=False)
     for t in np.linspace(-2, 2, 41).tolist():
         assert repeated.at(t) == pytest.approx((0.25 + 2 * t) % 0.5 if t >= 0 else max(0.25 + 2 * t, 0.0))
         assert held.at(t) == np.clip(0.25 + 2 * t, 0, 0.5)

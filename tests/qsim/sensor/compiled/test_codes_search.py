@@ -23,14 +23,17 @@ from qsim.sensor.spad import BinarySPAD
 EXPOSURE = 5e-4  # s
 SHAPE = (2, 128, 162)  # 41 472 pixels: a frame of uniform light, one below 20 electrons
 ORIGINS = ((0, 0), (5, 8), (3, 7))
-BATCHES, SENSORS = 20, 375  # of random sensors, and 5 for every number of terms: 10 000
+# of random sensors, and 5 for every number of terms: 10 000
+BATCHES = 20
+SENSORS = 375
 needs_engine = pytest.mark.skipif(not jit.available(), reason="no usable LLVM or CUDA on this machine")
 
 
 def random_sensor(rng: np.random.Generator, bits: int) -> Sensor:
     """Half of them QIS, of the rest half clocked, and of the counting ones a third paralyzable."""
     kind = rng.choice(["QIS", "clocked", "counting", "paralyzable"], p=[0.5, 0.25, 0.17, 0.08])
-    efficiency, dark = float(rng.uniform(0.02, 1)), float(rng.choice([0.0, 10 ** rng.uniform(-1, 5)]))
+    efficiency = float(rng.uniform(0.02, 1))
+    dark = float(rng.choice([0.0, 10 ** rng.uniform(-1, 5)]))
     if kind == "QIS":
         return QIS(
             efficiency,
@@ -91,7 +94,9 @@ class Count:
 
 def compare(sensor: Sensor, rng: np.random.Generator, count: Count, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both engines on the same light; AssertionError with the sensor's repr if more than 3 pixels differ."""
-    photons, origin, key = random_light(rng, sensor), ORIGINS[rng.integers(3)], Key(int(rng.integers(1 << 31)), 7)
+    photons = random_light(rng, sensor)
+    origin = ORIGINS[rng.integers(3)]
+    key = Key(int(rng.integers(1 << 31)), 7)
     asked = []
     draw_at = type(sensor).draw_at
 
@@ -127,14 +132,17 @@ def check(count: Count) -> None:
 
 
 def random_batch(seed: int, sensors: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    rng, count = np.random.default_rng([18, seed]), Count()
+    rng = np.random.default_rng([18, seed])
+    count = Count()
     for n in range(sensors):
         compare(random_sensor(rng, 1 + n % 8 if n % 10 else int(rng.integers(9, 17))), rng, count, monkeypatch)
     check(count)
 
 
 def batch_of_terms(terms: list[int], seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    rng, count, seen = np.random.default_rng([19, seed]), Count(), Counter()
+    rng = np.random.default_rng([19, seed])
+    count = Count()
+    seen = Counter()
     for number in terms:
         sensor = sensor_of_terms(rng, number)
         seen[terms_of(sensor)] += 1
@@ -204,7 +212,9 @@ def corner_light(rng: np.random.Generator, sensor: Sensor, shape: tuple[int, ...
 
 def corner_batch(seed: int, sensors: int) -> None:
     """Frames of any width at any origin, both ways to write codes, and a crop: 5 pixels per million may differ."""
-    rng, pixels, differ = np.random.default_rng([20, seed]), 0, 0
+    rng = np.random.default_rng([20, seed])
+    pixels = 0
+    differ = 0
     for n in range(sensors):
         sensor = corner_sensor(rng, 1 + n % 8)
         width = int(rng.choice([1, 2, 3, 5, 7, 8, 9, 63, 130, 257]))
@@ -218,12 +228,15 @@ def corner_batch(seed: int, sensors: int) -> None:
         whole = sensor.sample(photons, EXPOSURE, key=key, origin=(y, x), engine="fast")
         packed = sensor.sample_packed(photons, EXPOSURE, key=key, origin=(y, x), engine="fast")
         np.testing.assert_array_equal(packed, pack(whole, sensor.bits), err_msg=repr(sensor))
-        top, left = int(rng.integers(shape[1])), int(rng.integers(width))
-        part, place = photons[:, top:, left:], (y + top, x + left)
+        top = int(rng.integers(shape[1]))
+        left = int(rng.integers(width))
+        part = photons[:, top:, left:]
+        place = (y + top, x + left)
         crop = sensor.sample(part, EXPOSURE, key=key, origin=place, engine="fast")
         found = np.count_nonzero(whole != expected), np.count_nonzero(crop != expected[:, top:, left:])
         assert max(found) <= 2, f"{found} pixels differ, key {key}, {shape} at {(y, x)}: {sensor!r}"
-        pixels, differ = pixels + whole.size + crop.size, differ + sum(found)
+        pixels = pixels + whole.size + crop.size
+        differ = differ + sum(found)
     assert differ <= max(5e-6 * pixels, 2)
 
 

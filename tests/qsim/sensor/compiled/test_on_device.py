@@ -18,7 +18,8 @@ def test_codes_equal_the_reference_for_random_sensors_sizes_and_crops():
     rng = np.random.default_rng(0)
     for name in rng.permutation(list(SENSORS))[:8]:
         shape = tuple(int(rng.integers(1, most)) for most in (4, 24, 70))
-        origin, key = tuple(rng.integers(0, 9, 2).tolist()), Key(int(rng.integers(100)), 5, int(rng.integers(50)))
+        origin = tuple(rng.integers(0, 9, 2).tolist())
+        key = Key(int(rng.integers(100)), 5, int(rng.integers(50)))
         photons = light(SENSORS[name], shape, seed=int(rng.integers(100)))
         expected = np.stack([SENSORS[name].sample(frame, EXPOSURE, key=key.at(key.frame + t), origin=origin,
                                                   engine="reference") for t, frame in enumerate(photons)])  # fmt: skip

@@ -58,7 +58,8 @@ def test_dead_pixels_never_fire_and_do_not_change_others():
 
 def test_afterpulses_reach_the_stationary_rate():
     """P(fire) = p / (1 - a (1 - p)) after some planes; neighbouring planes are then correlated with a (1 - p)."""
-    p, a = 0.3, 0.4
+    p = 0.3
+    a = 0.4
     photons = np.full((60, 40, 50), -np.log1p(-p))
     planes = sample(BinarySPAD(1.0, 0.0), photons, EXPOSURE, afterpulse=a)[20:].astype(float)
     rate = p / (1 - a * (1 - p))
@@ -71,9 +72,11 @@ def test_afterpulses_reach_the_stationary_rate():
 
 def test_crosstalk_raises_the_rate_as_four_neighbours_can():
     """Inside, P(fire) = 1 - (1 - p)(1 - p c)^4; at an edge with three neighbours, to the third power."""
-    p, c = 0.2, 0.15
+    p = 0.2
+    c = 0.15
     planes = sample(BinarySPAD(1.0, 0.0), np.full((60, 40, 50), -np.log1p(-p)), EXPOSURE, crosstalk=c).astype(float)
-    inside, edge = planes[:, 1:-1, 1:-1], planes[:, 0, 1:-1]
+    inside = planes[:, 1:-1, 1:-1]
+    edge = planes[:, 0, 1:-1]
     for part, neighbours in ((inside, 4), (edge, 3)):
         rate = 1 - (1 - p) * (1 - p * c) ** neighbours
         spread = rate * (1 - rate) * (1 + 12 * c * p)  # neighbours share sources: a bound on their covariance
@@ -82,7 +85,8 @@ def test_crosstalk_raises_the_rate_as_four_neighbours_can():
 
 def test_crosstalk_of_counts_adds_binomial_numbers():
     """Every count sends Binomial(1, c) to each of four neighbours: the mean grows by 4 c."""
-    c, mean = 0.05, 3.0
+    c = 0.05
+    mean = 3.0
     sensor = CountingSPAD(1.0, 0.0, 0.0, 8)
     codes = sample(sensor, np.full((20, 40, 50), mean), EXPOSURE, crosstalk=c)[:, 1:-1, 1:-1].astype(float)
     total = mean * (1 + 4 * c)
@@ -96,7 +100,10 @@ def test_a_crop_with_a_margin_equals_the_frame(bits):
     maps = draw_maps(FixedPattern(prnu=0.1, dark=DarkSpread(), dead=0.05), (17, 23))
     settings = {"afterpulse": 0.2, "crosstalk": 0.2}
     whole = sample(sensor, photons, EXPOSURE, maps=maps, **settings)
-    y, x, h, w = 4, 5, 6, 7
+    y = 4
+    x = 5
+    h = 6
+    w = 7
     part = (slice(None), slice(y - 1, y + h + 1), slice(x - 1, x + w + 1))
     inner = maps.crop(y - 1, x - 1, h + 2, w + 2)
     crop = sample(sensor, photons[part], maps=inner, origin=(y - 1, x - 1), **settings)
@@ -115,7 +122,8 @@ def test_stages_of_a_key_share_no_noise(settings):
     """Training and validation windows differ in the stage of their keys only."""
     codes = np.zeros((2, 20, 20), np.uint8)
     codes[0] = 1
-    noise, keys = CorrelatedNoise(**settings), (replace(KEY, stage=stage) for stage in range(3))
+    noise = CorrelatedNoise(**settings)
+    keys = (replace(KEY, stage=stage) for stage in range(3))
     stored, *windows = (noise.disturb(None, codes, 7, key, None, (0, 0))[0].astype(float) for key in keys)
     for one, other in ((stored, windows[0]), (stored, windows[1]), (windows[0], windows[1])):
         part = slice(1) if "crosstalk" in settings else slice(1, 2)

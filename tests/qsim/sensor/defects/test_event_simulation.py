@@ -122,7 +122,9 @@ def test_a_carried_dead_time_gives_the_renewal_rate():
 
     With a new start in every frame it counts more, as in the closed form.
     """
-    arrivals, share, frames = 6.0, 0.25, 10_000
+    arrivals = 6.0
+    share = 0.25
+    frames = 10_000
     expected = arrivals / (1 + arrivals * share)
     carried = counts(counter(share), constant(arrivals, frames), Memory(carry=True))
     whole = carried.reshape(-1, 100).sum(axis=1)[1:]  # 100 frames: the edges of a block weigh little
@@ -134,7 +136,8 @@ def test_a_carried_dead_time_gives_the_renewal_rate():
 
 
 def test_a_paralyzable_pixel_that_never_rests_counts_r_exp_minus_r_tau():
-    arrivals, share = 3.0, 0.3
+    arrivals = 3.0
+    share = 0.3
     drawn = counts(counter(share, paralyzable=True), constant(arrivals, 20_000), Memory(carry=True))
     mean = arrivals * np.exp(-arrivals * share)
     whole = drawn.reshape(-1, 100).sum(axis=1)
@@ -144,7 +147,8 @@ def test_a_paralyzable_pixel_that_never_rests_counts_r_exp_minus_r_tau():
 
 def test_afterpulses_multiply_the_counts_by_one_over_one_minus_p():
     """No dead time: an arrival starts a family of 1 / (1 - p) counts (geometric), mean square (1 + p) / (1 - p)^2."""
-    p, arrivals = 0.2, 4.0
+    p = 0.2
+    arrivals = 4.0
     memory = Memory(carry=True, afterpulse=p, afterpulse_delay=0.2 * EXPOSURE)
     drawn = counts(counter(0.0), constant(arrivals, 20_000), memory)
     whole = drawn.reshape(-1, 100).sum(axis=1)[1:]  # the first block starts without trapped carriers
@@ -228,7 +232,9 @@ def test_bright_paralyzable_pixels_are_followed():
 
 def test_light_that_varies_changes_a_bright_paralyzable_pixel_by_no_more_than_is_stated():
     """Half an exposure each at n (1 + c) and n (1 - c): r exp(-r tau) gives cosh(c x) - c sinh(c x)."""
-    n, x, c = 1e5, 8.0, 0.05
+    n = 1e5
+    x = 8.0
+    c = 0.05
     sensor = counter(x / n, bits=8, paralyzable=True)
     light = np.array([[n / 2 * (1 + c), n / 2 * (1 - c)]])
     stated = effects(sensor, light, EXPOSURE, EXPOSURE, NO_MEMORY).varying_flux
@@ -278,7 +284,9 @@ def test_dead_pixels_of_counters_stay_dead_when_followed():
 
 def test_followed_counts_have_crosstalk_as_those_of_the_closed_form():
     """Every count sends Binomial(1, c) to each of four neighbours: inside, the mean grows by 4 c; dead pixels stay."""
-    c, mean, shape = 0.05, 3.0, (4, 30, 31)
+    c = 0.05
+    mean = 3.0
+    shape = (4, 30, 31)
     maps = Maps(dead=np.zeros(shape[1:], bool))
     maps.dead[0, 7] = True
     array = PixelArray(CountingSPAD(1.0, 0.0, 0.0, 8), maps, Defects(crosstalk=c))

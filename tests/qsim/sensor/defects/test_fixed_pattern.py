@@ -70,7 +70,9 @@ def test_a_gain_map_has_mean_1_and_the_declared_spread():
 
 def test_uneven_response_does_not_shift_the_signal():
     """The mean count stays, and the variance between pixels grows by (s lambda)^2."""
-    sensor, spread, photons = CountingSPAD(1.0, 0.0, 0.0, 8), 0.1, 20.0
+    sensor = CountingSPAD(1.0, 0.0, 0.0, 8)
+    spread = 0.1
+    photons = 20.0
     maps = draw_maps(FixedPattern(prnu=spread), (200, 201))
     codes = PixelArray(sensor, maps).sample(np.full((1, 200, 201), photons), EXPOSURE, key=KEY).astype(float)
     assert_mean(codes, photons, photons + (spread * photons) ** 2)
@@ -83,7 +85,8 @@ def test_a_dark_map_has_mean_1_and_the_declared_share_of_hot_pixels(tail):
     spread = DarkSpread(hot_share=0.02, hot_to=100.0, tail=tail)
     dark = draw_maps(FixedPattern(dark=spread, device_seed=2), (401, 500)).dark
     v = (np.arange(200_000) + 0.5) / 200_000
-    hot, body = spread.draw(np.zeros_like(v), v), spread.draw(np.ones_like(v), v)
+    hot = spread.draw(np.zeros_like(v), v)
+    body = spread.draw(np.ones_like(v), v)
     mean = 0.02 * hot.mean() + 0.98 * body.mean()
     assert mean == pytest.approx(1.0, rel=1e-4)
     variance = 0.02 * (hot**2).mean() + 0.98 * (body**2).mean() - 1
@@ -98,7 +101,8 @@ def test_a_dark_map_has_mean_1_and_the_declared_share_of_hot_pixels(tail):
 def test_a_map_is_a_function_of_device_and_place():
     everything = FixedPattern(device_seed=9, prnu=0.1, dark=DarkSpread(), dead=0.05, offset=0.3, read_noise=0.2)
     whole = draw_maps(everything, (40, 50))
-    crop, again = draw_maps(everything, (7, 9), origin=(11, 13)), draw_maps(everything, (40, 50))
+    crop = draw_maps(everything, (7, 9), origin=(11, 13))
+    again = draw_maps(everything, (40, 50))
     other = draw_maps(replace(everything, device_seed=10), (40, 50))
     for name, value in vars(whole).items():
         np.testing.assert_array_equal(value, vars(again)[name])
@@ -117,7 +121,8 @@ def test_a_device_has_one_pattern_for_frames_and_crops(tmp_path):
     np.save(tmp_path / "gain.npy", rng.uniform(0.5, 1.5, (12, 15)))
     measured = {f"{name}_map": str(tmp_path / f"{name}.npy") for name in ("dead", "gain")}
     found = Defects(FixedPattern(device_seed=9, dark=DarkSpread()), measured)
-    whole, crop = PixelArray.of(found, SENSORS[0], 12, 15), PixelArray.of(found, SENSORS[0], 5, 6, (4, 7))
+    whole = PixelArray.of(found, SENSORS[0], 12, 15)
+    crop = PixelArray.of(found, SENSORS[0], 5, 6, (4, 7))
     for name in ("gain", "dark", "dead"):
         np.testing.assert_array_equal(vars(crop.maps)[name], vars(whole.maps)[name][4:9, 7:13])
     with pytest.raises(ValueError, match="has 12 x 15 pixels, the frames 5 x 6 at row 8, column 0; a map must cover"):
@@ -151,8 +156,10 @@ def test_measured_rates_become_a_map_of_mean_1():
 
 def test_read_out_maps_draw_from_the_cdf_of_each_pixel():
     """Two halves differ in offset and read noise; each follows the closed form of such a sensor."""
-    sensor, n = QIS(0.8, 1.6, 0.3, 3), 200
-    offset, noise = np.zeros((n, 2 * n)), np.ones((n, 2 * n))
+    sensor = QIS(0.8, 1.6, 0.3, 3)
+    n = 200
+    offset = np.zeros((n, 2 * n))
+    noise = np.ones((n, 2 * n))
     offset[:, n:], noise[:, n:] = 0.75, 3.0
     array = PixelArray(sensor, Maps(offset=offset, read_noise=noise))
     codes = array.sample(np.full((1, n, 2 * n), 3.0), EXPOSURE, key=KEY)
@@ -169,11 +176,13 @@ def test_drawn_read_out_maps_have_their_spread():
 
 def drawn_device(rng: np.random.Generator, shape: tuple[int, int]):
     """A random sensor with random maps; each map is absent in half of the cases."""
-    bits, some = int(rng.integers(1, 5)), lambda: bool(rng.random() < 0.5)
+    bits = int(rng.integers(1, 5))
+    some = lambda: bool(rng.random() < 0.5)
     rate = float(rng.choice([0.0, 300.0, 3000.0]))
     kind = rng.integers(3)
     if kind == 0:
-        noise, well = float(rng.choice([0.0, 0.2, 0.7])), float(rng.uniform(3, 30)) if some() else None
+        noise = float(rng.choice([0.0, 0.2, 0.7]))
+        well = float(rng.uniform(3, 30)) if some() else None
         sensor = QIS(0.8, rate, noise, bits, gain=float(np.exp(rng.normal(0, 0.7))), offset=0.3, full_well=well)
     elif kind == 1:
         sensor = BinarySPAD(0.4, rate, bits)
@@ -193,7 +202,9 @@ def drawn_device(rng: np.random.Generator, shape: tuple[int, int]):
 def test_the_exact_distribution_holds_for_random_devices():
     """Codes of random sensors and maps agree with `pmf` by chi-square; without the maps most disagree."""
     rng = np.random.default_rng(21)
-    devices, shape, blind = 60, (24, 25), 0
+    devices = 60
+    shape = (24, 25)
+    blind = 0
     for i in range(devices):
         sensor, maps = drawn_device(rng, shape)
         photons = rng.uniform(0.1, 6, shape) * float(np.exp(rng.normal(0, 0.7)))

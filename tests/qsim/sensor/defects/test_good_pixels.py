@@ -10,7 +10,10 @@ from sensor_files import QIS, SPAD, sensor_file
 from qsim.sensor import devices
 from qsim.sensor.defects import defect_table, good_pixels
 
-PPP, SIZE, HOT = 3.0, (40, 40), slice(None, None, 101)  # 1 % of the pixels are hot
+# 1 % of the pixels are hot
+PPP = 3.0
+SIZE = (40, 40)
+HOT = slice(None, None, 101)
 
 
 def hot_stream(folder, more: str = "", model: str = QIS):
@@ -56,7 +59,8 @@ def test_a_stream_without_defects_keeps_its_sensor(tmp_path):
 @pytest.mark.parametrize("origin", [(0, 0), (7, 3)])
 def test_a_map_larger_than_the_frames_gives_the_rate_of_those_it_covers(tmp_path, origin):
     """Hot pixels lie outside of the frames alone: their dark counts were taken off everywhere, one per frame."""
-    height, width = 20, 24
+    height = 20
+    width = 24
     rates = np.full((60, 70), 2e5)
     rates[: origin[0] + height, : origin[1] + width] = 20.0
     np.save(tmp_path / "rates.npy", rates)

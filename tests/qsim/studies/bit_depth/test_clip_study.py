@@ -110,7 +110,8 @@ def test_still_pixels_do_not_count_among_moving_ones(tmp_path, monkeypatch):
     """A third of the field rests: blur is that of the others, and light and peak stay those of the clip."""
     clip = wave_clip(tmp_path / "third", 32, 2, still=16)
     settings = StudySettings(bits=(1, 3), ppp=0.65, instants=2)
-    every, moving = study(clip, settings), study(clip, replace(settings, moving=True))
+    every = study(clip, settings)
+    moving = study(clip, replace(settings, moving=True))
     assert (every.share, moving.share) == (1.0, pytest.approx(2 / 3))
     assert (every.ppp, every.peak) == (moving.ppp, moving.peak)
     for one, other in zip(every.rows, moving.rows, strict=True):

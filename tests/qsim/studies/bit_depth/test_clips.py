@@ -51,7 +51,8 @@ def test_codes_of_summed_planes_belong_to_the_frames_of_their_own_clip(clip, tmp
     factor = light_level(clip, ppp=0.65).factor
     (path,) = write_streams(clip, tmp_path, StudySettings(bits=(3,), ppp=0.65))
     grouped = Clip.open(path)
-    planes, multibit = grouped.stream("planes"), grouped.stream("multibit")
+    planes = grouped.stream("planes")
+    multibit = grouped.stream("multibit")
     assert planes.meta["ppp_target"] == pytest.approx(7 * 0.65)
     for t in (0, len(grouped) - 1):
         middle = clip_photons(clip, 7 * t + 3, 7 * factor, sharp=True)
@@ -82,7 +83,8 @@ def test_a_clip_of_an_edited_scene_file_is_refused(tmp_path, monkeypatch):
 
     monkeypatch.setattr(clip_rendering, "render_clip", rendered)
     monkeypatch.setattr(fidelity, "choose_budget", lambda *_, **__: None)
-    file, shape = tmp_path / "own.py", ClipShape(2, 6, 8, frame_rate=10_000.0)
+    file = tmp_path / "own.py"
+    shape = ClipShape(2, 6, 8, frame_rate=10_000.0)
     file.write_text("from qsim.scenes.plain import scene\n")
     made = render(str(file), tmp_path / "own_x1", shape)
     assert list(made.meta["reads"]) == ["own.py"]

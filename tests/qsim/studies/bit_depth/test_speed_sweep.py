@@ -14,7 +14,8 @@ def test_sweep_over_speed_and_light(clip, tmp_path, capsys):
     words = ["tradeoff", str(clip.path), "--bits", "1,2,3", "--speed", "1,4", "--ppp", "0.3:30:2", "-o", str(out)]
     assert main([*words, "--instants", "2", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    cells, agreement = found["cells"], found["agreement"]
+    cells = found["cells"]
+    agreement = found["agreement"]
     assert len(cells) == agreement["cells"] == 2 * 2 * 2
     sigmas = [row["sigmas"] for study in found["studies"] for row in study["rows"]]
     assert len(sigmas) == agreement["simulated"] == 2 * 2 * 6

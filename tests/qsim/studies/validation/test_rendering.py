@@ -33,7 +33,8 @@ def test_the_naive_loop_renders_the_same_scene():
 def test_calls_of_the_naive_loop_draw_other_samples():
     """A large frame is rendered in several calls, whose mean is that of all their samples."""
     naive = NaiveLoop(renderer(plate(None, light=SunSky())))
-    one, other = naive.frame(2, 4), naive.frame(2, 4, 1)
+    one = naive.frame(2, 4)
+    other = naive.frame(2, 4, 1)
     np.testing.assert_array_equal(one, naive.frame(2, 4))
     assert (one != other).mean() > 0.5
 

@@ -29,7 +29,8 @@ def test_box_means_are_means(seed):
 def test_looking_is_linear_interpolation(seed):
     rng = np.random.default_rng(seed)
     height, width = (int(n) for n in rng.integers(1, 14, 2))
-    image, moved = rng.normal(size=(height, width)), rng.uniform(-6, 6, (2, height, width))
+    image = rng.normal(size=(height, width))
+    moved = rng.uniform(-6, 6, (2, height, width))
     place = np.mgrid[:height, :width] + moved
     seen, inside = mf.look(torch.from_numpy(image), torch.from_numpy(moved))
     expected = map_coordinates(image, place, order=1, mode="nearest")
@@ -47,7 +48,8 @@ def test_the_search_tries_every_velocity(seed, scale, speed):
     height, width = (int(n) for n in rng.integers(3, 8, 2))
     frames = rng.normal(0, 0.2, (len(offsets), height, width)).astype(np.float32)
     found = ps.search(torch.from_numpy(frames), offsets, scale, speed).numpy() / (ps.STEP * scale)
-    most, reference = round(speed / scale / ps.STEP), frames[offsets.index(0)]
+    most = round(speed / scale / ps.STEP)
+    reference = frames[offsets.index(0)]
     steps = np.arange(-most, most + 1)
     sums, counts = np.zeros((2, len(steps), len(steps), height, width))
     for i, v in enumerate(steps):
@@ -89,7 +91,8 @@ def test_the_search_tries_every_velocity(seed, scale, speed):
 def test_interpolation_keeps_the_stated_share_of_the_noise():
     rng = np.random.default_rng(5)
     for _ in range(6):
-        noise, move = rng.normal(size=(300, 300)), rng.uniform(-3, 3, 2)
+        noise = rng.normal(size=(300, 300))
+        move = rng.uniform(-3, 3, 2)
         moved = torch.from_numpy(np.broadcast_to(move[:, None, None], (2, 300, 300)).copy())
         seen = mf.look(torch.from_numpy(noise), moved)[0].numpy()[8:-8:2, 8:-8:2]  # neighbours share pixels
         assert_mean(seen**2, float(mf.kept_noise(moved)[0, 0]), 2 * float(mf.kept_noise(moved)[0, 0]) ** 2)
@@ -109,10 +112,12 @@ def test_noise_moves_nothing(level):
 
 def test_corrections_converge():
     """More corrections of a texture without noise never make its paths worse, as means with a negative lobe did."""
-    pyramid, offsets = window((0.4, -0.7), (0, 0), 0.05, seed=3), list(range(-5, 6))
+    pyramid = window((0.4, -0.7), (0, 0), 0.05, seed=3)
+    offsets = list(range(-5, 6))
     truth = torch.tensor([0.4, -0.7])[:, None, None]
     v = mf.enlarged(ps.search(pyramid[8], offsets, 8, mp.SPEED), pyramid[2].shape[1:])
-    a, errors = torch.zeros_like(v), []
+    a = torch.zeros_like(v)
+    errors = []
     for _ in range(9):
         v, a = mp.correct(pyramid[2], offsets, v, a, 2, 4)
         errors.append(float((v - truth)[:, 12:-12, 12:-12].square().mean().sqrt()))
@@ -175,7 +180,9 @@ def test_time_has_no_direction():
 def test_paths_follow_fine_stripes(seed):
     """Stripes of 8 to 14 px vanish in cells of 8 px; slow paths find them, up to a move along the stripes."""
     rng = np.random.default_rng(seed)
-    period, turn, speed = rng.uniform(8, 14), rng.uniform(0, np.pi), rng.uniform(0.7, 1.5)
+    period = rng.uniform(8, 14)
+    turn = rng.uniform(0, np.pi)
+    speed = rng.uniform(0.7, 1.5)
     across = np.array([np.sin(turn), np.cos(turn)])
     y, x = np.mgrid[:96, :96]
     frames = []

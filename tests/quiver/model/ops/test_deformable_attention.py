@@ -20,7 +20,8 @@ def inputs(count: int = 2, channels: int = 6, groups: int = 2, height: int = 5, 
 def bilinear(image: torch.Tensor, y: float, x: float) -> torch.Tensor:
     """Value [c] of an image [c, H, W] at a place; zero outside."""
     result = torch.zeros(len(image), dtype=image.dtype)
-    row, column = int(y // 1), int(x // 1)
+    row = int(y // 1)
+    column = int(x // 1)
     for r in (row, row + 1):
         for c in (column, column + 1):
             if 0 <= r < image.shape[1] and 0 <= c < image.shape[2]:
@@ -31,7 +32,8 @@ def bilinear(image: torch.Tensor, y: float, x: float) -> torch.Tensor:
 def attended(query, key, value, offset, n: int, y: int, x: int) -> torch.Tensor:
     """Return the result [C] at one pixel, tap by tap."""
     groups = offset.shape[2] // 2
-    logits, values = [], []
+    logits = []
+    values = []
     for s in range(key.shape[1]):
         for tap in range(9):
             found = []

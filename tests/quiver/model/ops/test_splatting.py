@@ -21,7 +21,8 @@ def slow_sums(image: Tensor, flow: Tensor) -> Tensor:
     sums = torch.zeros(channels + 1, height, width, dtype=image.dtype)
     for i in range(height):
         for j in range(width):
-            x, y = j + float(flow[0, i, j]), i + float(flow[1, i, j])
+            x = j + float(flow[0, i, j])
+            y = i + float(flow[1, i, j])
             for row in range(height):
                 for column in range(width):
                     share = max(0.0, 1 - abs(x - column)) * max(0.0, 1 - abs(y - row))
@@ -44,14 +45,16 @@ def test_whole_pixels_shift_and_leave_holes_of_zero():
 
 
 def test_two_sources_on_a_pixel_give_their_mean():
-    image, flow = torch.tensor([[[[1.0, 5.0, 9.0]]]]), torch.zeros(1, 2, 1, 3)
+    image = torch.tensor([[[[1.0, 5.0, 9.0]]]])
+    flow = torch.zeros(1, 2, 1, 3)
     flow[0, 0, 0, 0] = 1
     assert average_splat(image, flow).flatten().tolist() == [0, 3, 9]
 
 
 @pytest.mark.parametrize("scale", [0.3, 2.0, 1e9])
 def test_it_equals_a_slow_loop(scale):
-    image, flow = normal(2, 2, 6, 5), scale * normal(2, 2, 6, 5, seed=1)
+    image = normal(2, 2, 6, 5)
+    flow = scale * normal(2, 2, 6, 5, seed=1)
     found = average_splat(image, flow)
     for n in range(2):
         sums = slow_sums(image[n], flow[n])
@@ -69,13 +72,15 @@ def test_a_constant_image_stays_constant_where_anything_arrives():
 
 def test_gradients_are_those_of_finite_differences():
     """No landing point is near a whole pixel, where the slope jumps."""
-    image, whole = normal(1, 2, 3, 4), normal(1, 2, 3, 4, seed=1).round()
+    image = normal(1, 2, 3, 4)
+    whole = normal(1, 2, 3, 4, seed=1).round()
     flow = whole + 0.5 + 0.3 * torch.tanh(normal(1, 2, 3, 4, seed=2))
     assert torch.autograd.gradcheck(average_splat, (image.requires_grad_(), flow.requires_grad_()))
 
 
 def test_half_precision_is_summed_in_single():
-    image, flow = normal(1, 2, 6, 5).bfloat16(), normal(1, 2, 6, 5, seed=1).float()
+    image = normal(1, 2, 6, 5).bfloat16()
+    flow = normal(1, 2, 6, 5, seed=1).float()
     moved = average_splat(image, flow)
     assert moved.dtype == torch.float32
     assert (moved - average_splat(image.double(), flow.double())).abs().max() < 1e-5

@@ -46,7 +46,8 @@ def test_constant_frames_give_finite_numbers_and_gradients(network, value):
 def test_clips_of_a_batch_do_not_meet(network):
     frames = draw(2, 3, 1, 13, 10)
     with torch.no_grad():
-        together, alone = network(frames), torch.cat([network(frames[:1]), network(frames[1:])])
+        together = network(frames)
+        alone = torch.cat([network(frames[:1]), network(frames[1:])])
     assert (together - alone).abs().max() < 1e-9
 
 
@@ -68,7 +69,8 @@ def test_frames_beyond_the_look_ahead_need_not_be_there(network):
         return
     frames = draw(1, network.look_ahead + 7, 1, 12, 10)
     with torch.no_grad():
-        whole, early = network(frames), network(frames[:, : network.look_ahead + 3])
+        whole = network(frames)
+        early = network(frames[:, : network.look_ahead + 3])
     assert (whole[:, :3] - early[:, :3]).abs().max() < 1e-12
 
 
@@ -76,7 +78,8 @@ def test_ends_of_time_are_reflections(network):
     """A network of windows gives the same for a clip that was reflected by hand."""
     if not hasattr(network, "windows"):
         return
-    frames, before = draw(1, 4, 1, 16, 8), network.frames_in - 1 - network.look_ahead
+    frames = draw(1, 4, 1, 16, 8)
+    before = network.frames_in - 1 - network.look_ahead
     order = reflected(-before, 4 + network.frames_in - 1, 4)
     with torch.no_grad():
         assert torch.equal(network(frames), network.windows(frames[:, order]))
@@ -84,7 +87,8 @@ def test_ends_of_time_are_reflections(network):
 
 @pytest.mark.parametrize("name", SMALL)
 def test_half_precision_is_close(name):
-    network, frames = SMALL[name]().float(), draw(1, 3, 1, 24, 32, dtype=torch.float32)
+    network = SMALL[name]().float()
+    frames = draw(1, 3, 1, 24, 32, dtype=torch.float32)
     with torch.no_grad():
         exact = network(frames)
         with torch.autocast("cpu", torch.bfloat16):
@@ -102,7 +106,8 @@ def test_the_noise_of_a_sensor_reaches_the_networks_that_take_it(name):
     assert getattr(network, "takes_variance", False) == (name in TAKE_NOISE)
     if name not in TAKE_NOISE:
         return
-    frames, tables = draw(2, 4, 1, 16, 16), torch.stack([torch.full((9,), 0.02), torch.linspace(0, 0.3, 9)]).double()
+    frames = draw(2, 4, 1, 16, 16)
+    tables = torch.stack([torch.full((9,), 0.02), torch.linspace(0, 0.3, 9)]).double()
     with torch.no_grad():
         together, first, second = (network(frames, variance=table) for table in (tables, tables[0], tables[1]))
     assert (first - second).abs().max() > 1e-3 * first.std()

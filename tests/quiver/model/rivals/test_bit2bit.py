@@ -53,7 +53,8 @@ def described(state: dict[str, Tensor], x: Tensor) -> Tensor:
 
 
 def test_the_network_equals_the_description():
-    network, seen = SMALL["bit2bit"](), 7 * draw(2, 8, 1, 8, 16)
+    network = SMALL["bit2bit"]()
+    seen = 7 * draw(2, 8, 1, 8, 16)
     share = torch.tensor([0.3, 0.9]).double()
     volume = seen.transpose(1, 2)
     channels = [*(torch.sin(volume / 10**i) for i in range(10)), share.view(2, 1, 1, 1, 1).expand_as(volume)]
@@ -72,7 +73,8 @@ def test_the_published_network_has_the_published_parameters():
 
 def test_start_values_are_those_of_glorot():
     network = Bit2Bit()
-    weight, bias = network.down[3].conv2.weight.detach(), network.down[3].conv2.bias
+    weight = network.down[3].conv2.weight.detach()
+    bias = network.down[3].conv2.bias
     assert float(weight.std()) == pytest.approx((2 / (2 * 192 * 27)) ** 0.5, rel=5 * (2 * weight.numel()) ** -0.5)
     assert not bias.any()
 
@@ -100,8 +102,10 @@ def parts_of(planes: int, seed: int = 0) -> tuple[Tensor, Split]:
 @pytest.mark.parametrize("planes", [1, 3, 7, 100])
 def test_the_binomial_loss_is_the_likelihood_of_the_target(planes):
     output, parts = parts_of(planes)
-    one, share = 1 / (1 + np.exp(-output.numpy())), parts.share.view(2, 1, 1, 1, 1).numpy()
-    left, target = planes - parts.seen.numpy(), parts.target.numpy()
+    one = 1 / (1 + np.exp(-output.numpy()))
+    share = parts.share.view(2, 1, 1, 1, 1).numpy()
+    left = planes - parts.seen.numpy()
+    target = parts.target.numpy()
     chance = one * (1 - share) / (1 - one * share)
     ways = stats.binom.logpmf(target, left, chance) - target * np.log(chance) - (left - target) * np.log1p(-chance)
     wanted = -(stats.binom.logpmf(target, left, chance) - ways).sum() / left.sum()
@@ -156,7 +160,8 @@ def test_the_photon_loss_is_least_at_the_true_light():
 def test_the_binomial_law_keeps_noise_of_photon_counts():
     """As stated: for counts of mean m, the best answer is pi = m/(n - a + m p), which follows the noise of a."""
     _, parts = parts_of(7)
-    share, m = parts.share.view(2, 1, 1, 1, 1), 2.7
+    share = parts.share.view(2, 1, 1, 1, 1)
+    m = 2.7
     best = m / (7 - parts.seen + m * share)
     fits = best < 1
     output = torch.logit(best.clamp(max=0.999)).requires_grad_()
@@ -181,7 +186,8 @@ def test_the_restored_light_has_the_units_of_the_sensor():
         torch.manual_seed(1)
         network = lively(Bit2Bit(Bit2BitConfig(width=4, as_published=as_published, dark=0.01)))
         with torch.no_grad():
-            output, restored = network.output(7 * frames, torch.ones(1).double()), network(frames)
+            output = network.output(7 * frames, torch.ones(1).double())
+            restored = network(frames)
         if not as_published:  # pi = 1 - exp(-(light + dark))
             assert (1 - (-restored - 0.01).exp() - torch.sigmoid(output)).abs().max() < 1e-12
             continue
@@ -192,12 +198,14 @@ def test_the_restored_light_has_the_units_of_the_sensor():
 
 
 def test_long_clips_are_restored_in_pieces():
-    network, frames = SMALL["bit2bit"](), draw(1, 50, 1, 8, 8)
+    network = SMALL["bit2bit"]()
+    frames = draw(1, 50, 1, 8, 8)
     assert [(start, len(weight)) for start, weight in pieces(50)] == [(0, 32), (16, 32), (18, 32)]
     assert [start for start, _ in pieces(32)] == [0]
     assert sum(len(weight) for _, weight in pieces(3)) == 3
     with torch.no_grad():
-        restored, alone = network(frames), [network.piece(frames[:, s : s + 32]) for s in (0, 16, 18)]
+        restored = network(frames)
+        alone = [network.piece(frames[:, s : s + 32]) for s in (0, 16, 18)]
         assert torch.allclose(network(frames[:, :32]), alone[0])
     assert torch.allclose(restored[:, :16], alone[0][:, :16])
     frame = 20  # weights 12, 5, 3
@@ -221,7 +229,8 @@ def test_a_clip_is_learnt_from_itself(as_published):
         assert not [name for name, p in network.named_parameters() if p.grad is None or not p.grad.isfinite().all()]
     with torch.no_grad():
         restored = network(codes / 7)
-    dark, bright = restored[..., :4].mean(), restored[..., 4:].mean()
+    dark = restored[..., :4].mean()
+    bright = restored[..., 4:].mean()
     assert float(bright) > 1.5 * float(dark)
 
 

@@ -106,9 +106,11 @@ def test_the_transforms_begin_as_inverses():
 
 
 def test_the_noise_without_a_table_is_that_of_the_papers_sensor():
-    sensor, exposure = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25), 1 / 2000
+    sensor = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
+    exposure = 1 / 2000
     photons = np.geomspace(1e-3, 40, 1000)
-    mean, variance = sensor.mean(photons, exposure) / 7, sensor.variance(photons, exposure) / 49
+    mean = sensor.mean(photons, exposure) / 7
+    variance = sensor.variance(photons, exposure) / 49
     table = np.interp(mean, np.linspace(0, 1, len(VARIANCE)), VARIANCE)
     assert np.abs(table - variance).max() < 0.01 * variance.max()
 
@@ -118,8 +120,10 @@ def test_the_noise_without_a_table_is_that_of_the_papers_sensor():
 def test_the_noise_map_is_the_variance_of_the_band(space_to_depth, scale):
     """Binomial codes of seven draws: variance m(1 - m)/7. Tolerance: five sigma of a variance from n samples."""
     steps = np.linspace(0, 1, 201)
-    config, table = EMVDConfig(space_to_depth=space_to_depth), torch.from_numpy(steps * (1 - steps) / 7)[None]
-    network, generator = EMVD(config).double(), torch.Generator().manual_seed(0)
+    config = EMVDConfig(space_to_depth=space_to_depth)
+    table = torch.from_numpy(steps * (1 - steps) / 7)[None]
+    network = EMVD(config).double()
+    generator = torch.Generator().manual_seed(0)
     m = 0.3
     codes = (torch.rand(7, 1, 1, 1, 512, 512, generator=generator) < m).double().mean(dim=0)
     with torch.no_grad():
@@ -134,7 +138,9 @@ def test_streaming_equals_the_clip():
     network = golden_emvd.small()
     frames = draw(1, 4, 1, 16, 24)
     with torch.no_grad():
-        whole, state, table = network(frames), None, table_of(None, frames)
+        whole = network(frames)
+        state = None
+        table = table_of(None, frames)
         for t, image in enumerate(network.packed(frames).unbind(1)):
             output, state = network.step(state, image, table)
             assert torch.equal(network.unpacked(output), whole[:, t])

@@ -25,8 +25,10 @@ def described(state: dict[str, Tensor], name: str, images: list[Tensor], maps: l
         return F.conv2d(x, state[f"{name}.{place}.weight"], state[f"{name}.{place}.bias"], padding=1, **how)
 
     def cbr(x: Tensor, part: str, i: int, **how: int) -> Tensor:
-        x, norm = plain(x, f"{part}.{i}", **how), f"{name}.{part}.{i + 1}."
-        mean, variance = state[norm + "running_mean"], state[norm + "running_var"]
+        x = plain(x, f"{part}.{i}", **how)
+        norm = f"{name}.{part}.{i + 1}."
+        mean = state[norm + "running_mean"]
+        variance = state[norm + "running_var"]
         x = (x - mean[:, None, None]) / (variance[:, None, None] + 1e-5).sqrt()
         return (x * state[norm + "weight"][:, None, None] + state[norm + "bias"][:, None, None]).clamp(min=0)
 
@@ -42,8 +44,10 @@ def described(state: dict[str, Tensor], name: str, images: list[Tensor], maps: l
 
 
 def test_a_window_equals_the_description():
-    network, frames = small(), draw(2, 5, 1, 12, 20)
-    state, images = network.state_dict(), list(frames.unbind(1))
+    network = small()
+    frames = draw(2, 5, 1, 12, 20)
+    state = network.state_dict()
+    images = list(frames.unbind(1))
     maps = list(deviation_map(frames, table_of(None, frames)).unbind(1))
     with torch.no_grad():
         once = [described(state, "first", images[i : i + 3], maps[i : i + 3]) for i in range(3)]
@@ -54,7 +58,9 @@ def test_a_window_equals_the_description():
 
 
 def test_a_clip_is_restored_window_by_window_with_first_results_computed_once():
-    network, frames, calls = small(), draw(1, 6, 1, 8, 12), []
+    network = small()
+    frames = draw(1, 6, 1, 8, 12)
+    calls = []
     network.first.register_forward_hook(lambda *_: calls.append(1))
     order = [2, 1, 0, 1, 2, 3, 4, 5, 4, 3]
     with torch.no_grad():
@@ -65,7 +71,8 @@ def test_a_clip_is_restored_window_by_window_with_first_results_computed_once():
 
 
 def test_a_restored_frame_depends_on_two_frames_on_either_side():
-    network, frames = small(), draw(1, 9, 1, 8, 8)
+    network = small()
+    frames = draw(1, 9, 1, 8, 8)
     changed = frames.clone()
     changed[:, 4] = 1 - changed[:, 4]
     with torch.no_grad():
@@ -90,10 +97,12 @@ def test_start_values_are_those_of_he():
 
 def test_a_window_is_learnt():
     torch.manual_seed(0)
-    network, truth = FastDVDnet(FastDVDnetConfig(width=4)), draw(1, 1, 1, 2, 2, dtype=torch.float32)
+    network = FastDVDnet(FastDVDnetConfig(width=4))
+    truth = draw(1, 1, 1, 2, 2, dtype=torch.float32)
     truth = truth.repeat_interleave(4, -1).repeat_interleave(4, -2)
     frames = (truth + 0.2 * torch.randn(1, 5, 1, 8, 8)).clamp(0, 1)
-    optimiser, losses = torch.optim.Adam(network.parameters(), 1e-2), []
+    optimiser = torch.optim.Adam(network.parameters(), 1e-2)
+    losses = []
     for _ in range(12):
         loss = (network.windows(frames) - truth).square().mean()
         optimiser.zero_grad()

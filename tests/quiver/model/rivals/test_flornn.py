@@ -67,7 +67,8 @@ def test_every_stage_equals_the_published_one(path):
 
 
 def test_batches_sizes_and_frame_counts_give_all_stages():
-    arrays, weights = random_inputs(2, 4, 3, 23, 12), small_weights()
+    arrays = random_inputs(2, 4, 3, 23, 12)
+    weights = small_weights()
     whole = stages(arrays, weights)
     assert len(whole) == 12
     assert whole["output"].shape == (2, 4, 3, 23, 12)
@@ -134,7 +135,8 @@ def test_start_values_are_small():
 def test_a_clip_is_restored_from_its_reflection():
     """The call for users equals the published run on a clip that was reflected by hand."""
     network = fill_by_rule(FloRNN(SIZES)).double()
-    frames, generator = draw(1, 5, 1, 12, 15), torch.Generator().manual_seed(1)
+    frames = draw(1, 5, 1, 12, 15)
+    generator = torch.Generator().manual_seed(1)
     flows = Flows(*(torch.randn(1, 4, 2, 12, 15, generator=generator, dtype=torch.float64) for _ in range(2)))
     order = [0, 1, 2, 3, 4, 3, 2, 1]
     forward = torch.stack([*flows.forward[0], *(flows.backward[0, i] for i in (3, 2, 1))])[None]
@@ -164,7 +166,8 @@ def test_a_warp_from_outside_gives_zero():
 
 def test_the_noise_map_is_the_deviation_of_the_sensor():
     """Flat frames, at the table's light: its variances; 0 as published."""
-    network, table = FloRNN(FloRNNConfig(width=2, blocks=1)).double(), torch.linspace(0.01, 0.2, 15).double()
+    network = FloRNN(FloRNNConfig(width=2, blocks=1)).double()
+    table = torch.linspace(0.01, 0.2, 15).double()
     levels = torch.linspace(0, 1, 15).double().view(15, 1, 1, 1, 1).expand(15, 1, 1, 6, 7)
     assert (network.noise(levels, table)[:, 0, 0, 3, 3] ** 2 - table).abs().max() < 1e-7
     assert network.noise(levels, table).std(dim=(-1, -2)).max() < 1e-9
@@ -182,7 +185,8 @@ def test_half_precision_is_close():
     network = FloRNN(FloRNNConfig(width=8, blocks=2, look_ahead=3, flow_channels=(4, 4))).eval()
     frames = draw(1, 5, 1, 24, 32, dtype=torch.float32)
     with torch.no_grad():
-        flows, exact = network.flows(frames), network(frames)
+        flows = network.flows(frames)
+        exact = network(frames)
         with torch.autocast("cpu", torch.bfloat16):
             close = network(frames, flows)
     assert float((close.float() - exact).square().mean().sqrt() / exact.std()) < 0.03
@@ -195,7 +199,8 @@ def test_published_weights_load_with_the_frozen_flow_network_left_out():
 
 
 def test_missing_and_misshapen_flows_are_refused():
-    network, frames = FloRNN(SIZES), torch.zeros(1, 3, 1, 12, 12)
+    network = FloRNN(SIZES)
+    frames = torch.zeros(1, 3, 1, 12, 12)
     with pytest.raises(ValueError, match="no flow network; give the flows"):
         network(frames)
     with pytest.raises(ValueError, match=r"flows must be \(1, 2, 2, 12, 12\) forward and backward, got"):

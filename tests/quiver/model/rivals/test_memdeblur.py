@@ -117,7 +117,8 @@ def test_the_published_network_has_the_published_parameters():
 
 
 def test_every_frame_sees_the_whole_clip():
-    network, frames = golden_memdeblur.small(), draw(1, 7, 1, 16, 12)
+    network = golden_memdeblur.small()
+    frames = draw(1, 7, 1, 16, 12)
     with torch.no_grad():
         exact = network(frames)
         for t in (0, 3, 6):
@@ -127,7 +128,8 @@ def test_every_frame_sees_the_whole_clip():
 
 
 def test_the_input_is_centred_but_for_the_published_form():
-    ours, published = MemDeblur(TINY).eval(), MemDeblur(MemDeblurConfig(8, 1, 1, as_published=True)).eval()
+    ours = MemDeblur(TINY).eval()
+    published = MemDeblur(MemDeblurConfig(8, 1, 1, as_published=True)).eval()
     published.load_state_dict(ours.state_dict())
     frames = draw(1, 2, 1, 16, 16, dtype=torch.float32)
     with torch.no_grad():
@@ -140,7 +142,8 @@ def test_many_frames_and_both_memories_of_a_long_clip():
     frames = draw(1, 14, 1, 32, 20)
     golden_memdeblur.remember_as_in_training(network)
     with torch.no_grad():
-        training, evaluation = network(frames), network.eval()(frames)
+        training = network(frames)
+        evaluation = network.eval()(frames)
     assert training.isfinite().all()
     assert (training - evaluation).abs().max() > 1e-9
 

@@ -17,7 +17,8 @@ def drawn(*shape: int) -> torch.Tensor:
 @pytest.mark.parametrize("count", [1, NEAREST, 33])
 def test_a_read_is_a_weighted_sum_over_the_nearest_entries(count, training):
     """The affinity (2 k.q - |k|^2)/sqrt(width) is the negative squared distance but for a constant."""
-    stored, query = Stored(drawn(2, 8, count), drawn(2, 5, count)), drawn(2, 8, 3, 2)
+    stored = Stored(drawn(2, 8, count), drawn(2, 5, count))
+    query = drawn(2, 8, 3, 2)
     read = Attention().train(training)(stored, query)
     for b, y, x in ((0, 0, 0), (1, 2, 1)):
         distances = (stored.keys[b] - query[b, :, y, x, None]).square().sum(dim=0) / math.sqrt(8)
@@ -29,7 +30,8 @@ def test_a_read_is_a_weighted_sum_over_the_nearest_entries(count, training):
 def test_a_memory_keeps_the_latest_entries_in_the_unit_of_the_last_key():
     memory = Memory(8, group_norm=False).eval()
     sizes = [(4, 4), (1, 2), (1, 2), (3, 1)]
-    stored, wanted = None, 0
+    stored = None
+    wanted = 0
     for number, size in enumerate(sizes):
         key = torch.full((1, 8, *size), float(number))
         stored = memory.write(stored, key, key[:, :5])
@@ -47,7 +49,8 @@ def test_keys_and_values_have_a_quarter_of_the_size_and_return(group_norm):
     memory = fill_by_rule(Memory(8, group_norm)).double().eval()
     feature = draw(2, FEATURES, 7, 9)
     with torch.no_grad():
-        key, value = memory.key(feature), memory.value_encoder_mem(draw(2, 2 * FEATURES, 7, 9))
+        key = memory.key(feature)
+        value = memory.value_encoder_mem(draw(2, 2 * FEATURES, 7, 9))
         assert key.shape == (2, 8, 2, 3)
         assert value.shape == (2, 32, 2, 3)
         read = memory.read(memory.write(None, key, value), key)

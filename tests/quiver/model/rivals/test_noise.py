@@ -17,7 +17,8 @@ def test_the_table_is_read_at_its_nodes_and_between():
 
 
 def test_every_clip_reads_its_own_table():
-    frames, tables = draw(3, 2, 1, 6, 7), torch.rand(3, 9, dtype=torch.float64)
+    frames = draw(3, 2, 1, 6, 7)
+    tables = torch.rand(3, 9, dtype=torch.float64)
     together = deviation_map(frames, table_of(tables, frames))
     for i in range(3):
         alone = deviation_map(frames[i : i + 1], table_of(tables[i], frames[i : i + 1]))
@@ -32,9 +33,11 @@ def test_half_precision_reads_the_table_exactly():
 
 
 def test_the_deviation_is_that_of_the_mean_around_a_pixel():
-    table, frames = torch.tensor([0.0, 0.5, 2.0]), draw(2, 3, 1, 9, 8)
+    table = torch.tensor([0.0, 0.5, 2.0])
+    frames = draw(2, 3, 1, 9, 8)
     found = deviation_map(frames, table_of(table, frames))
-    inner, corner = frames[1, 2, 0, 2:7, 1:6].mean(), frames[0, 0, 0, :3, :3].mean()
+    inner = frames[1, 2, 0, 2:7, 1:6].mean()
+    corner = frames[0, 0, 0, :3, :3].mean()
     for mean, deviation in ((inner, found[1, 2, 0, 4, 3]), (corner, found[0, 0, 0, 0, 0])):
         wanted = (mean if mean < 0.5 else 3 * mean - 1) ** 0.5  # 0 to 0.5 to 2
         assert deviation == pytest.approx(float(wanted), rel=1e-6)

@@ -128,7 +128,8 @@ def test_weights_depend_on_the_prefix_and_one_clip_has_fewer_stages():
 
 
 def test_an_odd_clip_is_reflected_at_its_end():
-    network, frames = golden_rvrt.small(), draw(1, 3, 1, 40, 36)
+    network = golden_rvrt.small()
+    frames = draw(1, 3, 1, 40, 36)
     with torch.no_grad():
         even = network(frames[:, [0, 1, 2, 1]])
         assert torch.equal(network(frames), even[:, :3])

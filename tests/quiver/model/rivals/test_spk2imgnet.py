@@ -103,7 +103,8 @@ def test_each_mistake_is_seen(mistake):
     exec(source.replace(right, wrong), module.__dict__)
     frames = draw(1, 10, 20, 24)
     with torch.no_grad():
-        found, wanted = liveliest(module).window(frames)[0], liveliest().window(frames)[0]
+        found = liveliest(module).window(frames)[0]
+        wanted = liveliest().window(frames)[0]
     assert (found - wanted).abs().max() > 0.1 * wanted.std()
 
 
@@ -149,7 +150,8 @@ def test_groups_of_three_reach_equally_far_into_past_and_future():
 
 
 def test_the_factor_of_the_port_is_missing_only_as_published():
-    mended, port = golden_spk2imgnet.small(), Spk2ImgNet(Spk2ImgNetConfig(width=8, blocks=1, as_published=True))
+    mended = golden_spk2imgnet.small()
+    port = Spk2ImgNet(Spk2ImgNetConfig(width=8, blocks=1, as_published=True))
     port.double().load_state_dict(mended.state_dict())
     frames = draw(1, 2, 1, 8, 8)
     with torch.no_grad():

@@ -42,7 +42,8 @@ def described(state: dict[str, Tensor], frames: Tensor) -> tuple[Tensor, list[Te
 
 
 def test_the_student_equals_the_description():
-    network, frames = lively(StudentTeacher(SMALL)), draw(2, 11, 10, 8)
+    network = lively(StudentTeacher(SMALL))
+    frames = draw(2, 11, 10, 8)
     with torch.no_grad():
         wanted, half = described(network.state_dict(), frames)
         found = network.student(frames)
@@ -60,7 +61,8 @@ def test_the_networks_have_the_specified_parameters():
 
 
 def test_a_clip_is_restored_window_by_window_without_the_teachers():
-    network, frames = lively(StudentTeacher(SMALL)), draw(1, 4, 1, 8, 10)
+    network = lively(StudentTeacher(SMALL))
+    frames = draw(1, 4, 1, 8, 10)
     order = reflected(-5, 14, 4)
     for teacher in (network.motion_teacher, network.noise_teacher):
         teacher.register_forward_hook(lambda *_: pytest.fail("a teacher was called"))
@@ -71,8 +73,10 @@ def test_a_clip_is_restored_window_by_window_without_the_teachers():
 
 
 def test_features_are_compared_without_their_scale_and_mean():
-    a, b = draw(2, 3, 5, 4), draw(2, 3, 5, 4, seed=1)
-    scale, shift = draw(2, 3, 1, 1, seed=2) + 0.5, draw(2, 3, 1, 1, seed=3)
+    a = draw(2, 3, 5, 4)
+    b = draw(2, 3, 5, 4, seed=1)
+    scale = draw(2, 3, 1, 1, seed=2) + 0.5
+    shift = draw(2, 3, 1, 1, seed=3)
     assert float(feature_distance(a, scale * a + shift)) < 1e-5
     assert float(feature_distance(a, -a)) == pytest.approx(4, rel=1e-4)
     assert float(feature_distance(a, scale * b - shift)) == pytest.approx(float(feature_distance(a, b)), rel=1e-4)
@@ -90,7 +94,8 @@ def test_constant_features_have_a_finite_slope():
 
 
 def test_the_loss_is_the_error_and_the_weighted_distances():
-    restored, target = draw(2, 1, 6, 6), draw(2, 1, 6, 6, seed=1)
+    restored = draw(2, 1, 6, 6)
+    target = draw(2, 1, 6, 6, seed=1)
     own, motion, noise = (draw(2, 3, 3, 3, seed=seed) for seed in (2, 3, 4))
     student = Taught(restored, (own, 2 * own))
     error = float((restored - target).square().mean())
@@ -104,7 +109,8 @@ def test_the_loss_is_the_error_and_the_weighted_distances():
 
 def test_each_teacher_leads_its_own_encoder():
     """Gradients of one distance reach one encoder of the student, and no teacher."""
-    network, frames = lively(StudentTeacher(SMALL)), draw(1, 11, 8, 8)
+    network = lively(StudentTeacher(SMALL))
+    frames = draw(1, 11, 8, 8)
     with torch.no_grad():
         motion = network.motion_teacher(draw(1, 11, 8, 8, seed=1)).features[0]
         noise = network.noise_teacher(draw(1, 11, 8, 8, seed=2)).features[0]
@@ -121,7 +127,8 @@ def test_each_teacher_leads_its_own_encoder():
 
 def test_a_teacher_cannot_copy_its_input():
     """Without weights in its last layer a teacher gives nothing: it adds no frame."""
-    teacher, frames = lively(StudentTeacher(SMALL)).motion_teacher, draw(1, 11, 8, 8)
+    teacher = lively(StudentTeacher(SMALL)).motion_teacher
+    frames = draw(1, 11, 8, 8)
     for parameter in teacher.decoder.leave[-1].parameters():
         torch.nn.init.zeros_(parameter)
     assert not teacher(frames).restored.any()
