@@ -26,8 +26,7 @@ streams = {bits: clip.sense("spad-320x240", bits=bits, ppp=2.0 * (2**bits - 1), 
 errors = {}
 figure, axes = plt.subplots(1, len(depths), figsize=(2.4 * len(depths), 2.8), layout="constrained")
 for axis, (bits, stream) in zip(axes, streams.items(), strict=True):
-    planes = 2**bits - 1
-    middle = len(stream) // 2
+    planes, middle = 2**bits - 1, len(stream) // 2
     found = stream.sensor.response(stream.exposure).invert(stream.codes[middle].astype(float), samples=1) / planes
     truth = stream.truth(middle, middle + 1)[0] / planes
     errors[bits] = float(np.mean((found - truth) ** 2))

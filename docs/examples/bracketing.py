@@ -14,9 +14,7 @@ import numpy as np
 import qsim
 import quiver
 
-# tests: 16, 6
-side = 64
-frames = 12
+side, frames = 64, 12  # tests: 16, 6
 clip = qsim.render("glossy", frames=frames, height=side, width=side, frame_rate=8000, psnr=32)
 full = clip.sense("quiver-physical", ppp=12, bits=3, name="full")
 bracketed = clip.sense("quiver-physical", ppp=12, bits=3, exposures=(1, 1 / 4, 1 / 16), name="bracketed")

@@ -21,10 +21,7 @@ import qsim
 from qsim.cli import main
 from quiver.cli import main as quiver
 
-# tests: 16, 9, 0.2
-side = 96
-planes = 64
-speed = 0.2
+side, planes, speed = 96, 64, 0.2  # tests: 16, 9, 0.2
 clip = qsim.render(
     "text", "text", frames=planes, height=side, width=side, frame_rate=16_000, speed=speed, bands="rgb", psnr=28
 )

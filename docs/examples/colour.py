@@ -24,8 +24,7 @@ print(clip[5].shape, [f"{wavelength * 1e9:.0f} nm" for wavelength in clip.bands]
 
 streams = {mask: clip.sense("quiver-physical", ppp=8, bits=5, colour=mask) for mask in ("rggb", "quad", "rgbw")}
 for mask, stream in streams.items():
-    codes = stream.codes()
-    tile = stream.colour_filter.mask
+    codes, tile = stream.codes(), stream.colour_filter.mask
     means = {tile[i][j]: codes[:, i :: len(tile), j :: len(tile)].mean() for i, j in np.ndindex(len(tile), len(tile))}
     print(mask, ", ".join(f"mean code of {colour} {mean:.1f}" for colour, mean in sorted(means.items())))
 

@@ -22,8 +22,7 @@ pixels = {
 }
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
 for name, pixel in pixels.items():
-    mean = pixel.mean(light, exposure)
-    variance = pixel.variance(light, exposure)
+    mean, variance = pixel.mean(light, exposure), pixel.variance(light, exposure)
     left.plot(light, mean, label=name)
     right.plot(light, variance / mean, label=name)
     print(f"{name:20} at 200 photons: mean count {np.interp(200, light, mean):.2f}")

@@ -32,9 +32,7 @@ axis.legend()
 # %%
 # A wall under the tube. The clip holds its strength in every frame, and the mean of the codes follows it.
 
-# tests: 12, 8
-side = 48
-frames = 40
+side, frames = 48, 40  # tests: 12, 8
 wall = Body("wall", sheet(4, 4), Diffuse(Texture(0.3 + 0.4 * np.random.default_rng(0).random((9, 9)))))
 tube = AreaLamp((1, 2, 3), (0, 0, 0), 1.2, 0.2, 20.0, flicker=RectifiedSine(120))
 camera = Camera(focal_length=8e-3, f_number=2.8, pixel_pitch=2e-4, height=side, width=side, origin=(0, 0, 4))

@@ -22,10 +22,7 @@ from qsim.scene import Body, Constant, Diffuse, Glow, Oscillation, Scene, Spin, 
 from qsim.scene.camera_path import read_camera_path
 from qsim.scene.shapes import sheet
 
-# tests: 48, 64, 4
-side = 96
-samples = 1024
-frames = 12
+side, samples, frames = 96, 1024, 12  # tests: 48, 64, 4
 camera = Camera(25e-3, 1.4, 5e-5 * 96 / side, side, 7 * side, origin=(0, 0, 0), target=(0, 0, -1), aperture_blur=True)
 camera = replace(camera, focus_distance=0.5)
 depths = 0.5 * np.geomspace(0.6, 1.8, 7)

@@ -17,9 +17,7 @@ import qsim
 from qsim import CountingSPAD
 from qsim.formats import photon_times
 
-# tests: 12, 2
-side = 96
-frames = 4
+side, frames = 96, 4  # tests: 12, 2
 clip = qsim.render("fan", frames=frames, height=side, width=side, speed=4, psnr=30)
 sensor = CountingSPAD(pde=0.5, dark_count_rate=200.0, dead_time=2e-5, bits=5)
 stream = clip.sense(sensor, ppp=12, follow=True, name="photons")

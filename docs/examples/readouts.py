@@ -16,9 +16,7 @@ import qsim
 from qsim import QIS, SpikeCamera
 from qsim.studies.readouts import compare
 
-# tests: 16, 4
-side = 96
-speed = 4
+side, speed = 96, 4  # tests: 16, 4
 clip = qsim.render("fan", frames=36, height=side, width=side, frame_rate=20_000, speed=speed, psnr=34)
 spike = SpikeCamera(quantum_efficiency=0.6, dark_current=100.0, threshold=1000)
 camera = QIS(0.6, 100.0, 5.0, 12, gain=4095 / 10_000, full_well=10_000.0)  # at ISO 100 the full well fills the code

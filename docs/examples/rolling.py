@@ -18,10 +18,7 @@ from qsim.clip.rows import Rows
 from qsim.scene import Body, Camera, Constant, Diffuse, Scene, Translation
 from qsim.scene.shapes import sheet
 
-# tests: 16, 16_000, 4
-side = 64
-rate = 16_000
-per_code = 8
+side, rate, per_code = 64, 16_000, 8  # tests: 16, 16_000, 4
 wall = Body("wall", sheet(4, 4), Diffuse(0.2))
 speed = 200.0  # m/s
 pole = Body("pole", sheet(0.1, 1.0), Diffuse(0.8), Translation((speed, 0, 0), (-0.1, 0, 0.02)))

@@ -30,8 +30,7 @@ from qsim.scene import (
 from qsim.scene.shapes import revolved, sheet
 from qsim.scene.textures import checker
 
-count = 6
-length = 0.3
+count, length = 6, 0.3
 joints = tuple(
     Joint(Pendulum((0, -length * i / count, 0), (0, 0, 1), 0.35, 20.0, phase=-0.9 * i), parent=i - 1)
     for i in range(count)
@@ -55,9 +54,7 @@ axis.legend(loc="upper left", bbox_to_anchor=(1, 1))
 # %%
 # Rendered at 2000 frames per second. Flow, depth and body belong to the point of the skin behind each pixel.
 
-# tests: 12, 3
-height = 96
-frames = 9
+height, frames = 96, 9  # tests: 12, 3
 camera = Camera(8e-3, 2.8, 1.1e-6, 512, 768, origin=(0, -0.15, 6), target=(0, -0.15, 0))
 wall = Body("wall", sheet(1.2, 0.8), Diffuse(0.4), Translation((0, 0, 0), (0, -0.15, -0.1)))
 tentacle = Body("tentacle", skin, RoughPlastic(Texture(checker(8, 24, 0.05, 0.9)), 0.3), motion)

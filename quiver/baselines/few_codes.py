@@ -37,9 +37,9 @@ LIGHTS = 160  # levels of light of a fit, over three decades
 GRID = 1024  # levels of light from DARKEST on
 COARSE = 8  # of these levels one is taken for the second order
 FIRST = 0.05  # of the range of the mean, where its power of the light is taken
-# That power, up to which estimates are made unbiased. Over QIS of 1 to 3 bits, gains of 0.22 to 1 and read noise of 0.05
-# to 0.4 e-, in windows of 3 and 11 codes, unbiased estimates then err at most 1.2 times as much (rms) as the plain ones;
-# at powers of 1.2 to 1.5 it is up to 5 times, above up to 10, and the bias of three codes stays.
+# That power, up to which estimates are made unbiased. Over QIS of 1 to 3 bits, gains of 0.22 to 1 and read noise of
+# 0.05 to 0.4 e-, in windows of 3 and 11 codes, unbiased estimates then err at most 1.2 times as much (rms) as the
+# plain ones; at powers of 1.2 to 1.5 it is up to 5 times, above up to 10, and the bias of three codes stays.
 STEEPEST = 1.19
 DARKEST = 1e-5  # of the brightest light: the first level above darkness
 FEW = 1e-3  # Poisson events of a full exposure: the first level has no more, however bright the last one is

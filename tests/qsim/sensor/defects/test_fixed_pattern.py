@@ -177,7 +177,10 @@ def test_drawn_read_out_maps_have_their_spread():
 def drawn_device(rng: np.random.Generator, shape: tuple[int, int]):
     """A random sensor with random maps; each map is absent in half of the cases."""
     bits = int(rng.integers(1, 5))
-    some = lambda: bool(rng.random() < 0.5)
+
+    def some() -> bool:
+        return bool(rng.random() < 0.5)
+
     rate = float(rng.choice([0.0, 300.0, 3000.0]))
     kind = rng.integers(3)
     if kind == 0:
