@@ -508,8 +508,8 @@ def tiny(name: str) -> torch.nn.Module:
 
 
 def few(setting: cost.CostSettings) -> cost.CostSettings:
-    """Four of 14 frames, in place of 16 of 26."""
-    return replace(setting, frames=14, restored=4)
+    """Two of 12 frames, in place of 16 of 26."""
+    return replace(setting, frames=12, restored=2)
 
 
 @pytest.fixture(scope="module")  # of this module alone: what it replaces is back for the next one
