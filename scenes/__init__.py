@@ -148,10 +148,9 @@ def _from_file(path: Path) -> Family:
         raise FileNotFoundError(f"scene {path}: no such file")
     spec = importlib.util.spec_from_file_location(f"scene_{path.stem}", path)
     assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
+    try:  # not by the spec's loader, which leaves a folder __pycache__ beside the user's file
+        exec(compile(path.read_bytes(), str(path), "exec", dont_inherit=True), module.__dict__)
     except SyntaxError as error:
         raise ValueError(f"{path}:{error.lineno}: not valid Python: {error.msg}") from None
     if not callable(getattr(module, "scene", None)):

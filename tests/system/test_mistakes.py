@@ -122,7 +122,7 @@ MISTAKES = [
     ("qsim sense lit --ppp 3 --lux 3", "give the light level as --ppp or as --lux, not both"),
     ("qsim sense lit --ppp 1e300", "times its own light; allowed are 1e-30 to 1e+30 times"),
     ("qsim sense video", "its radiance is relative (imported video) and has no absolute light; give a target"),
-    ("qsim sense video --lux 3", "has no lux; give a target in photons per pixel, as in --ppp 3.25"),
+    ("qsim sense video --lux 3", "which lux need; give --pixel-pitch, as in --pixel-pitch 1.1e-06, where 1 lx"),
     ("qsim sense black --ppp 3", "black: mean of photons is 0, no factor reaches 3 PPP; is the light on?"),
     # Sensors and streams
     ("qsim sense lit --ppp 3 --exposures 1,0", "--exposures: expected a number above 0, got '0'"),
@@ -179,7 +179,7 @@ MISTAKES = [
     ("qsim demo lit", "lit: is a clip, which holds nothing else; name another folder"),
     ("qsim demo data", "data: is a data set, which holds nothing else; name another folder"),
     ("qsim demo data/clips/fan_0000/streams", "streams: is part of a clip, which holds nothing else"),
-    ("qsim demo light.npy", "light.npy: is a file where a folder is needed"),
+    ("qsim demo light.npy", "light.npy: exists and was not made by `qsim demo`; name another folder"),
     ("qsim tradeoff fan -o lit", "lit: is a clip, which holds nothing else; name another folder"),
     ("qsim convert data lit --to mp4", "lit: is a clip, which holds nothing else; name another folder"),
     ("qsim convert pictures lit --frame-rate 9 --transfer srgb", "lit: is a clip, which holds nothing else"),
