@@ -1,6 +1,7 @@
 """Orders files by the numbers in their names: 2 before 10, and decimals by their value.
 
-RAW_0.25 comes before RAW_0.5, and 1726830927.5 before 1726830928.125. Numbers are compared exactly.
+RAW_0.25 comes before RAW_0.5, and 1726830927.5 before 1726830928.125; a decimal comma and a power of ten with a sign
+(0,25, 1e-3) count as well. Numbers are compared exactly.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-_TOKEN = re.compile(r"([0-9]+(?:\.[0-9]+)*)")
+_COMMA = re.compile(r"(?<=[0-9]),(?=[0-9])")
+# A power has a sign and at most two digits, and no hexadecimal digit follows: 410e-41d4 is a part of an identifier.
+_TOKEN = re.compile(r"([0-9]+(?:\.[0-9]+)*(?:[eE][+-][0-9]{1,2}(?![0-9a-fA-F]))?)")
 
 
 def natural(name: str) -> tuple[list[Any], str]:
@@ -19,13 +22,18 @@ def natural(name: str) -> tuple[list[Any], str]:
     return _parts(name), name
 
 
+def _split(name: str) -> list[str]:
+    """Return texts and numbers of a name in turn, with a point in every decimal."""
+    return _TOKEN.split(_COMMA.sub(".", name))
+
+
 def _parts(name: str) -> list[Any]:
     """Return texts and numbers of a name in turn; it begins and ends with a text.
 
-    A point between digits makes a decimal; with two such points (10.11.2026) each number stands alone.
+    A point or a comma between digits makes a decimal; with two of them (10.11.2026) each number stands alone.
     """
     found: list[Any] = []
-    for i, part in enumerate(_TOKEN.split(name)):
+    for i, part in enumerate(_split(name)):
         if not i % 2:
             found.append(part)
         elif part.count(".") <= 1:
@@ -44,7 +52,7 @@ def _last(names: list[str]) -> list[Fraction] | None:
     After a number that is equal in all names, whole numbers without a gap count (shot1.9, shot1.10), else it is a
     decimal.
     """
-    tokens = [(_TOKEN.findall(name) or [""])[-1] for name in names]
+    tokens = [("", *_split(name)[1::2])[-1] for name in names]
     if not all(tokens):
         return None
     heads, tails = ([part.rpartition(".")[i] for part in tokens] for i in (0, 2))

@@ -53,6 +53,9 @@ def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):
         ["1726830927.5", "1726830927.75", "1726830928.125", "1726830928.2", "1726830928.25"],
         [f"shot1.{n}" for n in range(8, 12)],
         [f"{0.0625 * n:g}s" for n in range(1, 12)],
+        ["t_0,125", "t_0,25", "t_0,5", "t_1,0"],
+        ["1e-3s", "2e-3s", "1e-2s", "2.5e-1s", "1e+1s"],
+        ["77-310e-42d4_1", "77-310e-41d4_2", "77-9e-41d4_3"],
     ],
     ids=lambda names: names[0],
 )
