@@ -86,7 +86,7 @@ def read_mitsuba(
     reason = _rejected(mi, loaded)
     if reason is not None:
         del loaded  # what Mitsuba rejects must not outlive this call: it traces every light that exists
-        raise ValueError(f"{path}: Mitsuba cannot render it: {reason}{_cure(mi)}")
+        raise ValueError(f"{path}: Mitsuba cannot render it: {reason}{_cure(mi, reason)}")
     names = [shape.id() for shape in loaded.shapes()]
     parameters = mi.traverse(loaded)
     for name in motions:
@@ -125,8 +125,10 @@ def _reason(error: BaseException) -> str:
     return " ".join(str(error).split())[:400]
 
 
-def _cure(mi: Any) -> str:
-    """Return what helps against a spectrum that grey rendering lacks; empty in colour."""
+def _cure(mi: Any, reason: str) -> str:
+    """Return what helps against a spectrum that grey rendering lacks, or that no rendering here has."""
+    if "non-spectral" in reason:
+        return "; wavelengths are not rendered here: give the colour of this spectrum as <rgb> or <float>"
     return "" if mi.variant().endswith("_rgb") else "; if it needs colour, render with --bands rgb (bands='rgb')"
 
 
@@ -152,8 +154,9 @@ def load(mi: Any, path: str) -> Any:
             # Optimising would merge shapes and lose their names.
             loaded = mi.load_file(files.native(path), optimize=False)
     except REJECTIONS as error:
-        needs = _cure(mi) if "RGB" in str(error) else ""
-        raise ValueError(f"{path}: Mitsuba cannot load it: {_reason(error)}{needs}") from None
+        reason = _reason(error)
+        needs = _cure(mi, reason) if "RGB" in str(error) or "non-spectral" in reason else ""
+        raise ValueError(f"{path}: Mitsuba cannot load it: {reason}{needs}") from None
     if not isinstance(loaded, mi.Scene):
         raise ValueError(f"{path}: its root element is not <scene>; only scene files can be read")
     for i, shape in enumerate(loaded.shapes()):
