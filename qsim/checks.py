@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,13 @@ def shown(value: Any) -> str:
     if isinstance(value, int) and abs(value) >= 10**30:  # Python refuses to print thousands of digits
         return "a number of more than 30 digits"
     return repr(value)[:60]
+
+
+def file_path(value: Any) -> Path:
+    """Return the path of a name; `ValueError` for a value of another type."""
+    if not isinstance(value, str | os.PathLike):
+        raise ValueError(f"path is the name of a file or folder, got {shown(value)}")
+    return Path(value)
 
 
 def text(value: Any) -> str:

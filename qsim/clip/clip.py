@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 from qsim import colour as pictures
 from qsim import files
+from qsim.checks import shown
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
 from qsim.clip.manifest import RELATIVE
@@ -80,6 +81,8 @@ class Clip(ClipFolder):
         as in `colour="rggb"`. `Sensing` describes the other settings. A stream of equal settings is not drawn
         again. `ValueError` for settings that do not fit the clip; `FileExistsError` where `name` is taken by others.
         """
+        if not isinstance(sensor, Sensor | str | os.PathLike):
+            raise ValueError(f"sensor is a sensor record, a name or a .toml file, got {shown(sensor)}")
         chosen = sensor if isinstance(sensor, Sensor) else os.fspath(sensor)
         defects = os.fspath(defects) if isinstance(defects, os.PathLike) else defects
         colour = os.fspath(colour) if isinstance(colour, os.PathLike) else colour

@@ -23,6 +23,7 @@ from typing import Any, Self
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.checks import file_path
 from qsim.clip import exr
 from qsim.clip.lazy_array import LazyArray
 from qsim.clip.manifest import TRUTH, camera_of, read_manifest
@@ -47,7 +48,7 @@ class ClipFolder:
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Self:
         """Open a clip; `FileNotFoundError` or `ValueError` if it is incomplete, damaged or of another version."""
-        path = Path(path)
+        path = file_path(path)
         manifest = path / "clip.json"
         if not manifest.is_file():
             raise FileNotFoundError(_why_not(path))

@@ -20,6 +20,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import colour, files, locks, structure
+from qsim.checks import file_path
 from qsim.clip import gates
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
@@ -49,7 +50,7 @@ class Stream:
     @staticmethod
     def open(json_path: str | Path) -> Stream:
         """Open a stream; `FileNotFoundError` if it does not exist, `ValueError` if its description is damaged."""
-        if not (json_path := Path(json_path)).is_file():
+        if not (json_path := file_path(json_path)).is_file():
             raise FileNotFoundError(f"{json_path}: no such stream")
         meta = files.read_json(json_path)
         files.check_version(json_path, meta.get("format_version"), FORMAT_VERSION)

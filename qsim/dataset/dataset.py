@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import files, structure
+from qsim.checks import file_path
 from qsim.clip.clip import Clip
 from qsim.dataset.job import FRAME_RATE, Job
 from qsim.dataset.job_runner import make_record, record_path
@@ -36,7 +37,7 @@ class Dataset:
     @staticmethod
     def open(path: str | os.PathLike[str]) -> Dataset:
         """Open a data set; `FileNotFoundError` or `ValueError` if the folder is not one of this version."""
-        path = Path(path)
+        path = file_path(path)
         manifest = path / "dataset.json"
         remedy = f"`qsim generate RECIPE -o {path} --repair` writes it again"
         if not manifest.is_file():

@@ -19,6 +19,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files
+from qsim.checks import file_path
 from qsim.clip import exr
 from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE, check_outside
@@ -41,9 +42,7 @@ def read(path: Path | str, hints: Hints | None = None, *, compared: tuple[str, .
 
     `ValueError` for a hint without effect on this file, except those that the caller `compared` with it.
     """
-    if not isinstance(path, str | Path):
-        raise ValueError(f"path is the name of a file or folder, got {path!r:.60}")
-    path = Path(path)
+    path = file_path(path)
     hints = hints or Hints()
     layout = hints.layout or detect(path, hints)
     if layout not in LAYOUTS:

@@ -20,6 +20,8 @@ def test_own_sensors_leave_no_stream(tmp_path: Path):
     clip = write_clip(tmp_path / "clip", frames=2, height=6, width=8)
     with pytest.raises(ValueError, match="Own: is none of the models that a file can name"):
         clip.sense(Own(0.8, 1.6, 0.2, 3), ppp=3.0)
+    with pytest.raises(ValueError, match=r"sensor is a sensor record, a name or a \.toml file, got 3"):
+        clip.sense(3, ppp=3.0)
     assert clip.streams == ()
 
 
@@ -32,5 +34,6 @@ def test_a_name_alone_is_no_clip(given: str | Path):
 def test_reading_takes_a_name(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match="none: no such file"):
         read(str(tmp_path / "none"))
-    with pytest.raises(ValueError, match="path is the name of a file or folder, got 3"):
-        read(3)
+    for reads in (read, qsim.Clip.open, qsim.Stream.open, qsim.Dataset.open):
+        with pytest.raises(ValueError, match="path is the name of a file or folder, got 3"):
+            reads(3)
