@@ -113,6 +113,7 @@ def to_clip(
         name = "sensor" if capture.sensor is not None else "ppp"
         raise ValueError(f"{path}: {recording.source} holds light, which no sensor made; leave --{name} out")
     check_outside(path)
+    capture = _as_stated(path, recording, capture)
     recording = _within_halves(recording)
     frames, height, width = recording.shape
     meta: dict[str, Any] = {

@@ -148,6 +148,10 @@ def test_photron_recordings(tmp_path: Path, text: str, stored: int, depth: int, 
     recording = importing.read(tmp_path / "a.mraw", Hints(transfer="linear"))
     np.testing.assert_allclose(recording.read(0, 3), frames / (2**depth - 1), rtol=1e-6)
     assert (recording.frame_rate, recording.exposure) == (20000, 2e-5)
+    clip = importing.to_clip(recording, tmp_path / "clip", importing.Import(20000))
+    assert clip.meta["exposure"] == 2e-5
+    with pytest.raises(ValueError, match=r"--frame-rate 1000: Photron \.mraw state 20000; leave it out"):
+        importing.to_clip(recording, tmp_path / "other", importing.Import(1000))
     np.testing.assert_array_equal(everything(beside), frames)
     beside.write_text(text.format(**facts | {"frames": 4}))
     with pytest.raises(ValueError, match=f"3 frames, and {beside.name} states 4"):
