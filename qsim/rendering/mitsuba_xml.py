@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from qsim import files
-from qsim.checks import suggest
+from qsim.checks import file_path, suggest
 from qsim.device_lock import one_thread_at_a_time
 from qsim.optics.camera import Camera, Pose, Vector
 from qsim.optics.lens import Lens
@@ -69,7 +69,7 @@ def read_mitsuba(
         activate(in_colour(engine))
     import mitsuba as mi
 
-    path = Path(xml)
+    path = file_path(xml)
     motions = motions or {}
     loaded = load(mi, str(path))
     if not loaded.emitters():

@@ -29,7 +29,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from qsim import files
-from qsim.checks import suggest
+from qsim.checks import file_path, suggest
 from qsim.sensor import file_laws
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.file_laws import NOTHING, Conditions
@@ -265,7 +265,7 @@ def load(
         device = DEVICES[str(name)]
         made = device.make(ppp, device.bits if bits is None else bits, exposure)
         return made.with_dark_rate(made.dark_rate * conditions.dark.mean) if device.median and conditions.dark else made
-    path = Path(name)
+    path = file_path(name)
     if path.suffix != ".toml":
         raise ValueError(
             f"unknown sensor {str(name)!r}{suggest(str(name), DEVICES)}; `qsim doctor --devices` lists all"

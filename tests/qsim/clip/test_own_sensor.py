@@ -34,6 +34,6 @@ def test_a_name_alone_is_no_clip(given: str | Path):
 def test_reading_takes_a_name(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match="none: no such file"):
         read(str(tmp_path / "none"))
-    for reads in (read, qsim.Clip.open, qsim.Stream.open, qsim.Dataset.open):
+    for reads in (read, qsim.Clip.open, qsim.Stream.open, qsim.Dataset.open, qsim.load_sensor, qsim.read_mitsuba):
         with pytest.raises(ValueError, match="path is the name of a file or folder, got 3"):
             reads(3)
