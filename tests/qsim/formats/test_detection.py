@@ -278,3 +278,17 @@ def test_the_smoothest_layout_is_the_true_one(tmp_path, bits, layout):
     found = dict(re.findall(r"(\S+) \(roughness ([0-9.]+)\)", str(refused.value)))
     least = min(found, key=lambda name: float(found[name]))
     assert least == layout or "too rough to tell" in str(refused.value)
+
+
+def test_a_full_plane_read_as_two_halves_is_no_smoother(tmp_path):
+    """The halves of a bright shape alternate, which once passed for the noise of a smooth scene."""
+    rows = np.arange(512)[:, None] - 128
+    columns = np.arange(512) - 256
+    scene = np.where(rows**2 + columns**2 < 150**2, 0.98, 0.02)
+    planes = (np.random.default_rng(0).random((12, 512, 512), np.float32) < scene).astype(np.uint8)
+    path = tmp_path / "shape.bin"
+    path.write_bytes(raw_planes.spad512s(planes))
+    with pytest.raises(ValueError, match="choose one with --layout") as refused:
+        detection.detect(path)
+    found = dict(re.findall(r"(\S+) \(roughness ([0-9.]+)\)", str(refused.value)))
+    assert min(found, key=lambda name: float(found[name])) == "spad512s"
