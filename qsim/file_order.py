@@ -2,6 +2,8 @@
 
 RAW_0.25 comes before RAW_0.5, and 1726830927.5 before 1726830928.125; a decimal comma and a power of ten with a sign
 (0,25, 1e-3) count as well. Numbers are compared exactly.
+
+A minus between a text and a number may be a sign or a hyphen: z-1 beside z1 has signs, z-1 beside z-2 has hyphens.
 """
 
 from __future__ import annotations
@@ -13,8 +15,22 @@ from pathlib import Path
 from typing import Any
 
 _COMMA = re.compile(r"(?<=[0-9]),(?=[0-9])")
+_MINUS = "\N{MINUS SIGN}"  # stands for a hyphen that is a sign
 # A power has a sign and at most two digits, and no hexadecimal digit follows: 410e-41d4 is a part of an identifier.
-_TOKEN = re.compile(r"([0-9]+(?:\.[0-9]+)*(?:[eE][+-][0-9]{1,2}(?![0-9a-fA-F]))?)")
+_TOKEN = re.compile("(" + _MINUS + r"?[0-9]+(?:\.[0-9]+)*(?:[eE][+-][0-9]{1,2}(?![0-9a-fA-F]))?)")
+
+
+def _signed(names: list[str]) -> list[str]:
+    """Return the names with a minus sign for the hyphens that are one: other names have none at that place."""
+    parts = [_split(name) for name in names]
+    for i in range(0, min((len(each) for each in parts), default=0) - 1, 2):
+        texts = {each[i] for each in parts}
+        longest = max(texts, key=len)
+        if longest.endswith("-") and texts == {longest, longest[:-1]}:
+            for each in parts:
+                if each[i] == longest:
+                    each[i] = longest[:-1] + _MINUS
+    return ["".join(each) for each in parts]
 
 
 def natural(name: str) -> tuple[list[Any], str]:
@@ -27,6 +43,10 @@ def _split(name: str) -> list[str]:
     return _TOKEN.split(_COMMA.sub(".", name))
 
 
+def _number(part: str) -> Fraction:
+    return Fraction(part.replace(_MINUS, "-"))
+
+
 def _parts(name: str) -> list[Any]:
     """Return texts and numbers of a name in turn; it begins and ends with a text.
 
@@ -37,10 +57,10 @@ def _parts(name: str) -> list[Any]:
         if not i % 2:
             found.append(part)
         elif part.count(".") <= 1:
-            found.append(Fraction(part))
+            found.append(_number(part))
         else:
             first, *others = part.split(".")
-            found.append(Fraction(first))
+            found.append(_number(first))
             for other in others:
                 found += [".", Fraction(other)]
     return found
@@ -86,7 +106,7 @@ def places(paths: list[Path]) -> list[Fraction] | None:
 
     It is the counter of `numbered`, or the only number in which the names differ.
     """
-    names = [path.stem for path in paths]
+    names = _signed([path.stem for path in paths])
     if (counted := _counter(names)) is not None:
         return counted
     parts = [_parts(name) for name in names]
@@ -107,9 +127,11 @@ def numbered(paths: Iterable[Path], below: Path | None = None) -> list[Path]:
     """
     shown = [path for path in paths if not path.name.startswith(".")]
     if below is not None:
-        return sorted(shown, key=lambda path: natural(str(path.relative_to(below).with_suffix(""))))
-    counted = _counter([path.stem for path in shown])
-    keys = [_parts(path.stem) for path in shown] if counted is None else [[value] for value in counted]
+        inside = _signed([str(path.relative_to(below).with_suffix("")) for path in shown])
+        return [path for _, path in sorted(zip(map(natural, inside), shown, strict=True))]
+    names = _signed([path.stem for path in shown])
+    counted = _counter(names)
+    keys = [_parts(name) for name in names] if counted is None else [[value] for value in counted]
     ordered = sorted(
         zip(shown, keys, strict=True), key=lambda pair: (_parts(str(pair[0].parent)), pair[1], pair[0].name)
     )

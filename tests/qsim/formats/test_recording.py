@@ -55,6 +55,10 @@ def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):
         [f"{0.0625 * n:g}s" for n in range(1, 12)],
         ["t_0,125", "t_0,25", "t_0,5", "t_1,0"],
         ["1e-3s", "2e-3s", "1e-2s", "2.5e-1s", "1e+1s"],
+        # a hyphen is a sign where other names have none, and a hyphen where all have it
+        ["z-10", "z-1.5", "z-0.5", "z0.5", "z2"],
+        ["-2", "-1", "0", "1"],
+        ["z-1", "z-2", "z-10"],
         ["77-310e-42d4_1", "77-310e-41d4_2", "77-9e-41d4_3"],
     ],
     ids=lambda names: names[0],
