@@ -21,6 +21,7 @@ from qsim.sensor.distribution import Distribution
 _DOUBLINGS = 60  # of light, within which a sensor saturates
 _LEAST = 1e-12  # arrivals that stand for darkness in derivatives
 _PRECISION = 1e-13  # of roots, relative
+_DARKEST = 1e-9  # arrivals that stand for none, where slopes are 0 over 0
 _LEVEL = 1e-6  # of a log-likelihood: what rises by less has levelled out
 
 
@@ -72,7 +73,7 @@ def estimate(sensor: Distribution, exposure: float, histogram: Array, confidence
     """Return photons, lower and upper bound (`Estimate`) of one histogram [levels]."""
     codes = np.flatnonzero(histogram)
     likelihood = _Codes(sensor, exposure, codes, histogram[codes])
-    dark = sensor.dark_rate * exposure
+    dark = max(sensor.dark_rate * exposure, _DARKEST)
     end = _saturated(sensor, exposure)
     for code in _impossible(likelihood, dark, end):
         raise Impossible(code)
@@ -84,7 +85,13 @@ def estimate(sensor: Distribution, exposure: float, histogram: Array, confidence
     upper = inf if bright else _crossing(likelihood, peak - fall, best, inf, end)
     if bright:
         best = _crossing(likelihood, peak - log(2), best, dark, end)
-    return tuple((value - dark) / sensor.efficiency for value in (best, lower, upper))  # type: ignore[return-value]
+
+    def photons(arrivals: float) -> float:
+        if arrivals == dark:
+            return 0.0
+        return (arrivals - sensor.dark_rate * exposure) / sensor.efficiency
+
+    return photons(best), photons(lower), photons(upper)
 
 
 def _impossible(likelihood: _Codes, dark: float, end: float) -> list[int]:

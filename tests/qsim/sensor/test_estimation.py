@@ -155,3 +155,31 @@ def test_response_gives_the_light_of_a_mean_code_back(sensor: Sensor):
     light = np.linspace(0.2, 1.0, 5) * table.cap(100)
     np.testing.assert_allclose(table.invert(sensor.mean(light, EXPOSURE), 10**6), light, rtol=1e-4)
     assert table.invert(sensor.levels, 11) == table.cap(11) < table.photons[-1]
+
+
+@pytest.mark.parametrize(
+    ("sensor", "code"),
+    [
+        (QIS(0.37, 0.0, 30.0, 11, gain=45.0, full_well=20.7), 267),
+        (QIS(0.53, 0.0, 30.0, 9, gain=18.4), 41),
+        (QIS(0.91, 0.0, 30.0, 14, gain=15.7), 128),
+        (QIS(0.085, 0.0, 30.0, 13, gain=210.2, offset=-95.9), 533),
+    ],
+)
+def test_many_codes_of_a_sensor_without_dark_current_have_an_estimate(sensor, code):
+    """The search went down to no arrivals at all, where the slope is 0 over 0, and ended in an OverflowError."""
+    histogram = np.zeros(sensor.levels)
+    histogram[code] = 5
+    found = sensor.maximum_likelihood(histogram, 5e-4)
+    assert 0 <= found.lower <= found.photons <= found.upper
+    codes = np.full(5, code)
+    best, low = (sensor.log_likelihood(codes, float(light), 5e-4).sum() for light in (found.photons, found.lower))
+    assert best >= low - 1e-9
+
+
+def test_an_impossible_code_of_a_sensor_without_noise_is_refused():
+    sensor = QIS(0.54, 0.0, 0.0, 10, gain=0.0134, offset=114.7)
+    histogram = np.zeros(sensor.levels)
+    histogram[3] = 5
+    with pytest.raises(ValueError, match="probability 0 at every light level"):
+        sensor.maximum_likelihood(histogram, 5e-4)
