@@ -82,18 +82,34 @@ def _reads(path: Path) -> list[str]:
         body = ast.parse(path.read_bytes()).body
     except (SyntaxError, OSError, ValueError):
         return []  # the loader reports the error
-    for node in body:
-        if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["reads"]:
-            try:
-                entries = ast.literal_eval(node.value)
-            except ValueError:
-                entries = None
-            if not isinstance(entries, list | tuple) or not all(isinstance(entry, str) for entry in entries):
-                raise ValueError(
-                    f'{path}, line {node.lineno}: reads is a list of names, written out, as in reads = ["a.obj"]'
-                )
-            return list(entries)
-    return []
+    found = [node for node in body if _binds_reads(node)]
+    if not found:
+        return []
+    entries = _written_out(found[0])
+    if len(found) > 1 or not isinstance(entries, list | tuple) or not all(isinstance(one, str) for one in entries):
+        raise ValueError(
+            f'{path}, line {found[-1].lineno}: reads is a list of names, written out once, as in reads = ["a.obj"]'
+        )
+    return list(entries)
+
+
+def _written_out(node: ast.stmt) -> Any:
+    """Return the plain value of `name = value` or `name: type = value`; None for any other statement."""
+    plain = isinstance(node, ast.Assign) and len(node.targets) == 1 and isinstance(node.targets[0], ast.Name)
+    if not plain and not isinstance(node, ast.AnnAssign):
+        return None
+    try:
+        return ast.literal_eval(node.value)  # type: ignore[attr-defined]
+    except (ValueError, TypeError):
+        return None
+
+
+def _binds_reads(node: ast.stmt) -> bool:
+    """Return whether a statement of a file gives `reads` a value, in whatever way; inside a function it is another."""
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return False
+    names = [found for found in ast.walk(node) if isinstance(found, ast.Name) and isinstance(found.ctx, ast.Store)]
+    return any(found.id == "reads" for found in names)
 
 
 def _matching(path: Path, entry: str) -> set[Path]:

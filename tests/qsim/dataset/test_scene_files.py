@@ -109,6 +109,7 @@ def test_files_elsewhere_are_declared_by_absolute_or_relative_names(tmp_path: Pa
     (tmp_path / "shared.txt").write_text("2")
     lines = {f"reads = ['a.txt', {str(tmp_path / 'shared.txt')!r}]": str(tmp_path / "shared.txt")}
     lines["reads = ('a.txt', '../shared.txt')"] = "../shared.txt"
+    lines["reads: list[str] = ['a.txt', '../shared.txt']"] = "../shared.txt"
     for line, name in lines.items():
         path = small_scene(tmp_path / "scene", line)
         read = scene_files.load(path)[1]
@@ -122,9 +123,13 @@ def test_files_elsewhere_are_declared_by_absolute_or_relative_names(tmp_path: Pa
     [
         ("reads = ['b.txt']", "reads names 'b.txt', and there is no such file beside it"),
         ("reads = ['*.obj']", "reads names '*.obj', and there is no such file beside it"),
-        ("reads = [str(n) for n in range(3)]", "line 2: reads is a list of names, written out"),
-        ("reads = 'a.txt'", "line 2: reads is a list of names, written out"),
-        ("reads = ['a.txt', 3]", "line 2: reads is a list of names, written out"),
+        ("reads = [str(n) for n in range(3)]", "line 2: reads is a list of names, written out once"),
+        ("reads = 'a.txt'", "line 2: reads is a list of names, written out once"),
+        ("reads = ['a.txt']; reads += ['b.txt']", "line 2: reads is a list of names, written out once"),
+        ("if True: reads = ['a.txt']", "line 2: reads is a list of names, written out once"),
+        ("reads = others = ['a.txt']", "line 2: reads is a list of names, written out once"),
+        ("reads: list[str]", "line 2: reads is a list of names, written out once"),
+        ("reads = ['a.txt', 3]", "line 2: reads is a list of names, written out once"),
     ],
 )
 def test_a_wrong_declaration_is_refused(tmp_path: Path, line: str, told: str):
