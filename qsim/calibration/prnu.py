@@ -28,6 +28,7 @@ OUTLIER = 6.0  # robust standard deviations (1.4826 times the median absolute de
 CERTAIN = 5.0  # standard errors; a hot pixel exceeds the median by more
 WIDEST = 3.5  # the table of the response ends at this multiple of the brightest light of a flat
 STEEPEST = 1.0  # largest PRNU that is searched for
+_DEGREES = ((400, 6), (100, 4), (20, 2), (0, 0))  # of a smooth field: pixels from which on, and the degree
 BY_DARK = "by the dark frames"
 BY_FLAT = f"by the flat: {OUTLIER:g} robust sigmas above its smooth surface"
 
@@ -95,8 +96,8 @@ def hot_by_level(level: Array, error: float) -> Array:
 
 
 def surface(shape: tuple[int, int], pixels: int) -> Array:
-    """Return polynomials over the field [H * W, terms]: fourth degree, second below 100 pixels, constant below 20."""
-    degree = 6 if pixels >= 400 else 4 if pixels >= 100 else 2 if pixels >= 20 else 0
+    """Return polynomials over the field [H * W, terms], of the degree that so many pixels determine (_DEGREES)."""
+    degree = next(degree for least, degree in _DEGREES if pixels >= least)
     y, x = (np.linspace(-1, 1, n) if n > 1 else np.zeros(1) for n in shape)
     terms = [
         np.outer(np.polynomial.legendre.legval(y, np.eye(j + 1)[j]), np.polynomial.legendre.legval(x, np.eye(i + 1)[i]))

@@ -80,7 +80,9 @@ def starts_of(cells: Sequence[Cell], share: Array, darks: int, brightest: float)
     for number in steps:
         at = gain * (1 + number * step)
         total = variance / at**2
-        tried = () if hidden else NOISES if gain < 2 * FINE else (0.35, 0.6)
+        tried: tuple[float, ...] = NOISES if gain < 2 * FINE else (0.35, 0.6)
+        if hidden:
+            tried = ()
         if several:
             electrons = (cells[longest].mean - cells[shortest].mean) / at / (share[longest] - share[shortest])
             rest = sqrt(max(total - electrons * share[shortest], 0.01))
@@ -91,7 +93,9 @@ def starts_of(cells: Sequence[Cell], share: Array, darks: int, brightest: float)
         for noise in {*tried, *(sqrt(part * total) for part in PARTS)}:
             electrons = max(total - noise**2, 0.003 * total)
             add(at, cells[shortest].mean - at * electrons, noise, electrons)
-    visible = peaks[0].noise if peaks else 0.35 if gain >= FINE else 0.15
+    visible = 0.35 if gain >= FINE else 0.15
+    if peaks:
+        visible = peaks[0].noise
     return Starts(points, sqrt(variance) / gain if hidden else visible, hidden)
 
 

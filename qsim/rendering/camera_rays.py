@@ -76,7 +76,9 @@ class CameraRays:
     """Rays of a camera on a parallel engine. Numbers that change with time are data, so that they compile no kernel."""
 
     def __init__(self, mi: Any, camera: Camera, *, changes: bool = False) -> None:
-        self._mi, self._camera, self._changes = mi, camera, changes
+        self._mi = mi
+        self._camera = camera
+        self._changes = changes
         lens = camera.lens
         self._bends: _Bends | _Warp | None = None
         if lens is not None and lens.bends:
