@@ -66,8 +66,8 @@ is the PSNR by its measured noise and the bounces that the pilot omits. **sample
 the frame missed the requested PSNR, they were raised step by step until it was reached, so **reached** never misses
 **asked**. **naive** is a loop of one `mi.render` per frame, with the power of two of samples that reaches the same
 PSNR. All are in dB below [white](fidelity.md), clamped there. Lines with neighbours are of frames that share samples.
-[Another table](results/clips.md) has these scenes except mains and walker, at 40 dB, beside the program of commit
-5c22140. Glossy at 30 dB states 3.1 dB more than was reached: eight samples miss rare bright paths.
+[Another table](results/clips.md) has these scenes except mains and walker, at 40 dB, beside an earlier
+program. Glossy at 30 dB states 3.1 dB more than was reached: eight samples miss rare bright paths.
 """
 
 STORED_BEFORE = (

@@ -156,7 +156,7 @@ def sides(text: str) -> tuple[int, int]:
 def measured(old: Path, size: tuple[int, int], runs: int) -> dict[str, list[tuple[float, float]]]:
     """Return seconds per frame and memory of the counted runs of both programs."""
     programs = {
-        f"QBP + BM3D of {OLD}": Program(QBP, old, size, FRAMES),
+        "QBP + BM3D, earlier program": Program(QBP, old, size, FRAMES),
         "mergenet": Program(MERGENET, ROOT, size, FRAMES),
     }
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in programs}
