@@ -16,6 +16,7 @@ from typing import Any
 
 _COMMA = re.compile(r"(?<=[0-9]),(?=[0-9])")
 _MINUS = "\N{MINUS SIGN}"  # stands for a hyphen that is a sign
+_DATE = re.compile(r"(?<![0-9a-zA-Z])[0-9]+-[0-9]+-[0-9]+$")  # or a time: its last number counts nothing alone
 # A power has a sign and at most two digits, and no hexadecimal digit follows: 410e-41d4 is a part of an identifier.
 _TOKEN = re.compile("(" + _MINUS + r"?[0-9]+(?:\.[0-9]+)*(?:[eE][+-][0-9]{1,2}(?![0-9a-fA-F]))?)")
 
@@ -94,6 +95,8 @@ def _counter(names: list[str]) -> list[Fraction] | None:
 
     Each file has its own, and either none is left out or the names differ in more than numbers (3fa_1, 0c7_2).
     """
+    if all(_DATE.search(name) for name in names):
+        return None
     last = _last(names)
     if not last or len(set(last)) < len(last):
         return None

@@ -59,6 +59,8 @@ def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):
         ["z-10", "z-1.5", "z-0.5", "z0.5", "z2"],
         ["-2", "-1", "0", "1"],
         ["z-1", "z-2", "z-10"],
+        # days without a gap in three months
+        ["2026-01-02", "2026-01-03", "2026-02-01"],
         ["77-310e-42d4_1", "77-310e-41d4_2", "77-9e-41d4_3"],
     ],
     ids=lambda names: names[0],
