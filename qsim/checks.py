@@ -25,7 +25,10 @@ def shown(value: Any) -> str:
     """Return a value for a message, at most 60 characters."""
     if isinstance(value, int) and abs(value) >= 10**30:  # Python refuses to print thousands of digits
         return "a number of more than 30 digits"
-    return repr(value)[:60]
+    try:
+        return repr(value)[:60]
+    except RecursionError:
+        return "a value that is nested too deeply"
 
 
 def file_path(value: Any) -> Path:

@@ -1,0 +1,117 @@
+"""Declares settings once: type, bounds, unit and a line of help of each, in the dataclass that holds them.
+
+    bits: Annotated[Bits | None, setting("bits per code", unset="the sensor's own")] = None
+
+Options, keys of recipes, Python arguments, stored descriptions and the tables of the manual are made from these fields
+(`settings_of`). A record of settings checks itself by `records.settle` in its `__post_init__`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import MISSING, dataclass
+from typing import Annotated, Any, get_args, get_origin
+
+from msgspec import Meta
+
+from qsim import records
+
+
+def setting(
+    words: str,
+    *,
+    unit: str = "",
+    unset: str = "",
+    option: str = "",
+    short: str = "",
+    shown: str = "",
+    varied: bool = False,
+    recipe: bool = True,
+) -> Meta:
+    """Describe a field of a record of settings.
+
+    `words` are one line of help without its default. `unit` is that of the value. `unset` says what None means. `option` is the
+    name on the command line where it is not the field's, `short` its letter, and `shown` what stands for its value.
+    A `varied` setting may be a list on the command line and in a recipe: one result per value. `recipe` is False if
+    recipes have no such key.
+    """
+    extra = {"unit": unit, "unset": unset, "option": option, "short": short, "shown": shown}
+    return Meta(description=words, extra=extra | {"varied": varied, "recipe": recipe})
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One field of a record of settings."""
+
+    name: str
+    hint: Any  # its type, with bounds
+    default: Any  # MISSING if it must be given
+    help: str
+    unit: str
+    unset: str  # what None means
+    option: str  # name of the option, without dashes
+    short: str
+    shown: str
+    varied: bool
+    recipe: bool
+
+    @property
+    def required(self) -> bool:
+        return self.default is MISSING
+
+    @property
+    def expected(self) -> str:
+        """What its type expects, in words."""
+        return records.words_of(self.hint)
+
+    @property
+    def default_words(self) -> str:
+        """The default as the help and the manual print it; empty for a setting that must be given, or that is off."""
+        if self.unset:
+            return self.unset
+        if self.required or self.default is None or self.default is False:
+            return ""
+        return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
+
+    @property
+    def help_with_default(self) -> str:
+        """The line of help with its default, as in `bits per code (default: the sensor's own)`."""
+        if not self.default_words:
+            return self.help
+        mark = ": " if self.unset else " "
+        return f"{self.help} (default{mark}{self.default_words})"
+
+
+def settings_of(kind: Any) -> tuple[Setting, ...]:
+    """Return the declared settings of a record, in order; its other fields are no settings."""
+    hints = records.hints_of(kind)
+    found = []
+    for field in dataclasses.fields(kind):
+        hint = hints[field.name]
+        declared = _declaration(hint)
+        if declared is None:
+            continue
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        extra = dict(declared.extra or {})
+        extra["option"] = extra["option"] or field.name.replace("_", "-")
+        found.append(Setting(field.name, hint, default, declared.description or "", **extra))
+    return tuple(found)
+
+
+def given(record: Any) -> dict[str, Any]:
+    """Return the settings of a record that differ from their defaults, as plain values: what is stored and compared.
+
+    A setting that is off is never among them, so that a new one changes no digest.
+    """
+    names = {setting.name for setting in settings_of(type(record))}
+    return {name: value for name, value in records.plain(record).items() if name in names}
+
+
+def _declaration(hint: Any) -> Meta | None:
+    """Return the outermost description of a type that `setting` made; None if there is none."""
+    if get_origin(hint) is not Annotated:
+        return None
+    for note in get_args(hint)[1:]:
+        if isinstance(note, Meta) and note.description is not None:
+            return note
+    return None
