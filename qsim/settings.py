@@ -31,9 +31,9 @@ def setting(
     """Describe a field of a record of settings.
 
     `words` are one line of help without its default. `unit` is that of the value. `unset` says what None means.
-    `option` is the name on the command line where it is not the field's, `short` its letter, and `shown` what stands for its value.
-    A `varied` setting may be a list on the command line and in a recipe: one result per value. `recipe` is False if
-    recipes have no such key.
+    `option` is the name on the command line where it is not the field's, `short` its letter, and `shown` what stands
+    for its value. A `varied` setting may be a list on the command line and in a recipe: one result per value. `recipe`
+    is False if recipes have no such key.
     """
     extra = {"unit": unit, "unset": unset, "option": option, "short": short, "shown": shown}
     return Meta(description=words, extra=extra | {"varied": varied, "recipe": recipe})
