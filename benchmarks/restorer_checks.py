@@ -21,8 +21,8 @@ from numpy import ndarray as Array
 from PIL import Image, ImageDraw
 
 from qsim import colour
-from qsim.clip.clip import Clip
 from qsim.files import VERSION, write_bytes, write_json
+from qsim.streams.clip import Clip
 from qsim.tables import markdown_table
 from quiver.data.clips import mean_light, open_clips, peak_of, truth
 from quiver.data.codes import Codes, array_codes, sensed

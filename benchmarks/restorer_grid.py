@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from qsim.clip.clip import Clip
 from qsim.figures import new_figure, write_figure
 from qsim.files import VERSION, read_json, write_bytes, write_json
+from qsim.streams.clip import Clip
 from qsim.tables import markdown_table
 from quiver.data.clips import known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import sensed

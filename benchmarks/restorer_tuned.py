@@ -22,8 +22,8 @@ import numpy as np
 from restorer_grid import FRAMES, Place, measured, places
 from rows import keep_apart
 
-from qsim.clip.clip import Clip
 from qsim.files import VERSION, read_json, write_bytes, write_json
+from qsim.streams.clip import Clip
 from qsim.tables import markdown_table
 from quiver.data.clips import open_clips
 from quiver.model.weights import digest

@@ -12,8 +12,8 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import stated
-from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import MOVING
+from qsim.streams.clip import Clip
 
 MOTION = (1.0, 7.0)  # px/frame that the paper states
 EDGES = (MOVING, *np.arange(0.25, 20.25, 0.25).tolist(), np.inf)  # px/frame, of the histogram

@@ -22,13 +22,13 @@ from shard_page import WAYS, draw, page
 
 from qsim import files
 from qsim.cli.options import part_of
-from qsim.clip.clip import Clip
 from qsim.dataset import recipe
 from qsim.dataset.cost_forecast import kinds_of
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import shard
 from qsim.dataset.recipe import Recipe
 from qsim.files import VERSION, read_json, write_bytes, write_json
+from qsim.streams.clip import Clip
 
 ROOT = Path(__file__).parents[1]
 FORMAT = "qsim-shard-1"

@@ -16,9 +16,6 @@ from qsim.lazy_imports import lazy_names
 if TYPE_CHECKING:
     from qsim.calibration.qis import calibrate_qis
     from qsim.calibration.spad import calibrate_spad
-    from qsim.clip.clip import Clip
-    from qsim.clip.sensing import Sensing, replay, sense
-    from qsim.clip.stream import Stream
     from qsim.clip.writer import ClipWriter
     from qsim.dataset.dataset import Dataset
     from qsim.dataset.scene_rendering import render
@@ -38,6 +35,9 @@ if TYPE_CHECKING:
     from qsim.sensor.sensor import Sensor
     from qsim.sensor.spad import BinarySPAD
     from qsim.sensor.spike import SpikeCamera
+    from qsim.streams.clip import Clip
+    from qsim.streams.sensing import Sensing, replay, sense
+    from qsim.streams.stream import Stream
 
 __version__ = VERSION
 
@@ -45,7 +45,7 @@ _HOMES = {
     "BinarySPAD": "sensor.spad",
     "Camera": "optics.camera",
     "Budget": "rendering.budget",
-    "Clip": "clip.clip",
+    "Clip": "streams.clip",
     "ClipWriter": "clip.writer",
     "CountingSPAD": "sensor.counting",
     "Dataset": "dataset.dataset",
@@ -53,10 +53,10 @@ _HOMES = {
     "QIS": "sensor.qis",
     "Renderer": "rendering.renderer",
     "Scene": "scene.scene",
-    "Sensing": "clip.sensing",
+    "Sensing": "streams.sensing",
     "Sensor": "sensor.sensor",
     "SpikeCamera": "sensor.spike",
-    "Stream": "clip.stream",
+    "Stream": "streams.stream",
     "read_mitsuba": "rendering.mitsuba_xml",
     "calibrate_qis": "calibration.qis",
     "calibrate_spad": "calibration.spad",
@@ -66,8 +66,8 @@ _HOMES = {
     "pack": "sensor.packing",
     "render": "dataset.scene_rendering",
     "render_clip": "rendering.clip_rendering",
-    "replay": "clip.sensing",
-    "sense": "clip.sensing",
+    "replay": "streams.sensing",
+    "sense": "streams.sensing",
     "unpack": "sensor.packing",
 }
 

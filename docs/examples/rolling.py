@@ -14,9 +14,9 @@ import numpy as np
 
 import qsim
 from qsim import CountingSPAD
-from qsim.clip.rows import Rows
 from qsim.scene import Body, Camera, Constant, Diffuse, Scene, Translation
 from qsim.scene.shapes import sheet
+from qsim.streams.rows import Rows
 
 side, rate, per_code = 64, 16_000, 8  # tests: 16, 16_000, 4
 wall = Body("wall", sheet(4, 4), Diffuse(0.2))

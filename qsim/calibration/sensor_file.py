@@ -21,7 +21,6 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.calibration.frame_statistics import FrameStatistics, measure, measure_sums
 from qsim.calibration.results import Calibration
-from qsim.clip.stream import Stream
 from qsim.figures import figure_png, new_figure
 from qsim.files import load_array
 from qsim.formats import importing, photon_times
@@ -31,6 +30,7 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.stream import Stream
 
 _BLOCK_BYTES = 1 << 25
 _DARK_MAP = "_dark.npy"  # ends of file names

@@ -33,7 +33,7 @@ def add_compare(sub: Any) -> None:
 
 
 def _run_compare(args: argparse.Namespace) -> int:
-    from qsim.clip.clip import Clip
+    from qsim.streams.clip import Clip
     from qsim.studies import readouts
 
     found = readouts.compare(Clip.open(args.clip), args.streams or (), args.span)

@@ -10,12 +10,12 @@ from qsim import checks, files
 from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, command, note, output, refuse_idle
 from qsim.cli.options import check_free, count, positive
 from qsim.cli.reader_options import LAYOUT, add_reader_options, hints_of
-from qsim.clip.clip import Clip
-from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
 from qsim.formats.recording import Recording
+from qsim.streams.clip import Clip
+from qsim.streams.stream import Stream
 
 PICTURES = ("mp4", "png", "nerfstudio")  # kinds that show light through a transfer curve
 _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs", ".dat": "spike", ".npz": "photons"}

@@ -181,8 +181,8 @@ def add_explore(sub: Any) -> None:
 
 
 def _run_explore(args: argparse.Namespace) -> int:
-    from qsim.clip.clip import Clip
     from qsim.report.explore import explore_page
+    from qsim.streams.clip import Clip
 
     if (args.path / "dataset.json").is_file():
         raise ValueError(f"{args.path}: is a data set; name one of its clips, as in {args.path / 'clips'}/NAME")

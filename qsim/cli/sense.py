@@ -82,8 +82,8 @@ def add_sense(sub: Any) -> None:
 
 
 def _run_sense(args: argparse.Namespace) -> int:
-    from qsim.clip.rows import Rows
-    from qsim.clip.sensing import Sensing, sense
+    from qsim.streams.rows import Rows
+    from qsim.streams.sensing import Sensing, sense
 
     if args.force:
         args.after_interrupt = MAKES_AGAIN
@@ -156,7 +156,7 @@ def _light(meta: dict[str, Any]) -> dict[str, Any]:
 
 
 def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
-    from qsim.clip.sensing import replay
+    from qsim.streams.sensing import replay
 
     unused = [
         "group",
@@ -204,8 +204,8 @@ def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
 
 def _clips(path: Path) -> list[Any]:
     """Return the clips of a data set, or the one clip of a folder."""
-    from qsim.clip.clip import Clip
     from qsim.dataset.dataset import Dataset
+    from qsim.streams.clip import Clip
 
     if (path / "dataset.json").is_file():
         clips = Dataset.open(path).clips()

@@ -210,7 +210,7 @@ def _speeds(args: argparse.Namespace, shape: Any) -> list[float]:
     from functools import partial
 
     from qsim import scenes
-    from qsim.clip.clip import Clip
+    from qsim.streams.clip import Clip
     from qsim.studies.bit_depth import answer as tradeoff_answer
 
     if not args.px:
@@ -244,7 +244,7 @@ def _write_study(folder: Path, name: str, result: dict[str, Any], pictures: dict
 
 
 def _paper_figure(args: argparse.Namespace) -> int:
-    from qsim.clip.clip import Clip
+    from qsim.streams.clip import Clip
     from qsim.studies.bit_depth import clips as study_clips
     from qsim.studies.bit_depth import paper_figures
 

@@ -13,10 +13,10 @@ from numpy import ndarray as Array
 
 from qsim import files, structure
 from qsim.checks import check_video
-from qsim.clip.clip import Clip
-from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
 from qsim.files import Progress, load_array
+from qsim.streams.clip import Clip
+from qsim.streams.stream import Stream
 
 
 def lines(problems: list[str], names: str) -> list[str]:

@@ -18,8 +18,6 @@ from statistics import median
 from typing import Any, NamedTuple
 
 from qsim.backend import on_gpu
-from qsim.clip.clip import Clip
-from qsim.clip.sensing import frames_needed, sense
 from qsim.dataset import job_runner
 from qsim.dataset.job import Job
 from qsim.dataset.recipe import Recipe
@@ -28,6 +26,8 @@ from qsim.files import Progress
 from qsim.process import peak_memory
 from qsim.rendering.budget import Budget
 from qsim.rendering.reuse.sharing import Sharing
+from qsim.streams.clip import Clip
+from qsim.streams.sensing import frames_needed, sense
 from qsim.tables import text_table
 
 START = 3.0  # s, start of a worker process with its renderer, once per Limits.jobs jobs; measured on two cores

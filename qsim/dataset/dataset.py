@@ -1,7 +1,7 @@
 """Reads and checks a data set: a folder of clips that generation.py makes from one recipe.
 
 dataset.json   recipe, splits by scene, state of every job, its own checksum; rewritten when a generation ends
-clips/NAME     clip folders with their streams           (clip/clip.py)
+clips/NAME     clip folders with their streams           (streams/clip.py)
 jobs/NAME.json records with checksums; a clip counts as finished when its record exists (job_runner.py)
 """
 
@@ -14,11 +14,11 @@ from typing import Any
 
 from qsim import files, structure
 from qsim.checks import file_path
-from qsim.clip.clip import Clip
 from qsim.dataset.job import FRAME_RATE, Job
 from qsim.dataset.job_runner import make_record, record_path
 from qsim.dataset.recipe import SPLITS
 from qsim.files import Progress
+from qsim.streams.clip import Clip
 
 FORMAT_VERSION = 1
 

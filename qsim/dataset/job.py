@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from qsim import files
-from qsim.clip.sensing import Sensing
 from qsim.files import to_json
 from qsim.sensor.defects import defect_table
+from qsim.streams.sensing import Sensing
 
 FRAME_RATE = 2000.0  # Hz, unless a recipe states another
 

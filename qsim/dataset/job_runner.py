@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qsim import files, locks, scratch
-from qsim.clip.clip import Clip
-from qsim.clip.sensing import sense
 from qsim.dataset.job import Job
 from qsim.dataset.provenance import assets, origin, photographs
 from qsim.process import peak_memory
+from qsim.streams.clip import Clip
+from qsim.streams.sensing import sense
 
 if TYPE_CHECKING:
     from qsim.rendering.budget import Budget

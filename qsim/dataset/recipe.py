@@ -52,12 +52,12 @@ from typing import Any
 
 from qsim import checks, files
 from qsim.clip.clip_folder import ClipFolder
-from qsim.clip.sensing import Sensing, filters_of, prepare
 from qsim.dataset.job import FRAME_RATE, Job, Settings
 from qsim.dataset.recipe_sections.scenes_section import SETTINGS, jobs_of, settings_of
 from qsim.dataset.recipe_sections.streams_section import streams_of
 from qsim.dataset.recipe_sections.toml_section import Section, Text, file_name
 from qsim.optics.radiometry import RGB
+from qsim.streams.sensing import Sensing, filters_of, prepare
 from qsim.structure import Table
 
 SPLITS = checks.SPLITS

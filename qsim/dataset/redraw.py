@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from qsim import files
-from qsim.clip.clip import Clip
-from qsim.clip.simulation import stored
-from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.job_runner import record_path
 from qsim.files import Progress
+from qsim.streams.clip import Clip
+from qsim.streams.simulation import stored
+from qsim.streams.stream import Stream
 
 PROMISED = 5e-6  # share of codes in which the compiled engine may differ from the reference
 _BLOCK_PIXELS = 1 << 20

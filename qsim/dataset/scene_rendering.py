@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from qsim import checks
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import target_of
 from qsim.dataset import scene_files
 from qsim.files import NAME, Progress
@@ -22,6 +21,7 @@ from qsim.rendering.fidelity import choose_budget
 from qsim.scene import Scene
 from qsim.scene.camera_path import read_camera_path
 from qsim.scenes.colours import coloured
+from qsim.streams.clip import Clip
 
 FRAMES = 21
 SIDE = 128  # px, height and width of a family or a file unless others are given

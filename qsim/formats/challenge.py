@@ -22,13 +22,13 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import check_shape
-from qsim.clip.clip import Clip
-from qsim.clip.stream import Stream
 from qsim.colour import from_linear
 from qsim.files import decoding_errors, load_array
 from qsim.sensor import packing
 from qsim.sensor.colour_filter import MASKS
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.clip import Clip
+from qsim.streams.stream import Stream
 
 # of a cube of the benchmark
 PLANES = 1024

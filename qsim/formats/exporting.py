@@ -11,13 +11,13 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files, scratch
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import check_outside
-from qsim.clip.stream import Stream, orientation
 from qsim.colour import code_levels, peak
 from qsim.files import VERSION
 from qsim.formats import array_files, challenge, images, photon_times, raw_cameras, video
 from qsim.scene.camera_path import camera_path
+from qsim.streams.clip import Clip
+from qsim.streams.stream import Stream, orientation
 
 BLOCK = 16  # frames read at a time
 

@@ -21,9 +21,7 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.checks import file_path
 from qsim.clip import exr
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE, check_outside
-from qsim.clip.stream import Stream, write_packed
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
 from qsim.formats import gaps
@@ -35,6 +33,8 @@ from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.clip import Clip
+from qsim.streams.stream import Stream, write_packed
 
 
 def read(path: Path | str, hints: Hints | None = None, *, compared: tuple[str, ...] = ()) -> Recording:

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import check_outside
-from qsim.clip.stream import Stream
 from qsim.files import VERSION, Progress, replacing
+from qsim.streams.clip import Clip
+from qsim.streams.stream import Stream
 
 WINDOW = 11  # frames, as QUIVER takes them
 

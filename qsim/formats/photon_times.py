@@ -24,12 +24,12 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import check_shape
-from qsim.clip.rows import Rows, from_dict
-from qsim.clip.simulation import stored
-from qsim.clip.stream import Stream
 from qsim.files import decoding_errors
 from qsim.formats.recording import Hints, Recording
 from qsim.sensor.defects.event_simulation import DETECTED, RELEASED
+from qsim.streams.rows import Rows, from_dict
+from qsim.streams.simulation import stored
+from qsim.streams.stream import Stream
 from qsim.structure import is_positive, is_whole, list_of
 
 FORMAT = "qsim-photons-1"

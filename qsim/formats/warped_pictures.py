@@ -26,11 +26,11 @@ from numpy import ndarray as Array
 from scipy import ndimage
 
 from qsim import checks, files
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.scene.image_files import read_grey
 from qsim.scene.textures import noise, pictures_in
+from qsim.streams.clip import Clip
 from qsim.terminal import printable
 
 FINE = 2  # texels of a layer per pixel, at zoom 1

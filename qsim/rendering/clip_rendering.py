@@ -9,13 +9,13 @@ from dataclasses import asdict
 from typing import Any
 
 from qsim import files
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import PHYSICAL
 from qsim.clip.writer import ClipWriter
 from qsim.rendering.budget import Budget
 from qsim.rendering.engine import free_memory
 from qsim.rendering.renderer import Crop, Renderer
 from qsim.scene import Scene, describe
+from qsim.streams.clip import Clip
 
 
 def render_clip(

@@ -10,12 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsim import colour
-from qsim.clip import gates
 from qsim.clip.clamped_error import rms, stated
-from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, MOVING, SLOWEST, moving_mean
-from qsim.clip.photons import clip_photons
-from qsim.clip.stream import Stream
 from qsim.colour import bright_end
 from qsim.report import html as page
 from qsim.report.panels import (
@@ -35,6 +31,10 @@ from qsim.report.panels import (
 )
 from qsim.sensor.defects import defect_table, fixed_pattern
 from qsim.sensor.defects.pixel_array import PixelArray
+from qsim.streams import gates
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.stream import Stream
 
 if TYPE_CHECKING:
     from markupsafe import Markup

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons, light_level
 from qsim.report.clip_section import motion
 from qsim.report.html import environment, script
 from qsim.sensor import devices
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons, light_level
 
 FRAMES = 16  # largest number on a page, and of frames per code
 PIXELS = 1 << 15  # largest number in a frame; larger pictures are reduced by a whole factor

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from qsim import colour
 from qsim.clip.clamped_error import Errors, white_in
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
-from qsim.clip.photons import clip_photons
-from qsim.clip.stream import Stream
 from qsim.colour import bright_end
 from qsim.report import html as page
 from qsim.sensor.defects import good_pixels
 from qsim.sensor.demosaicing import demosaic, determines_bands
 from qsim.sensor.sensor import Sensor
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.stream import Stream
 
 if TYPE_CHECKING:
     from markupsafe import Markup

@@ -19,9 +19,7 @@ import numpy as np
 
 from qsim import colour, files
 from qsim.clip.clamped_error import stated, white_in
-from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import MOVING
-from qsim.clip.stream import Stream
 from qsim.dataset.checking import Restored
 from qsim.dataset.dataset import Dataset
 from qsim.files import Progress
@@ -41,6 +39,8 @@ from qsim.report.panels import (
     truth_panels,
     truth_photons,
 )
+from qsim.streams.clip import Clip
+from qsim.streams.stream import Stream
 
 # at most on top of a page
 _SENTENCES = 4

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from qsim import colour, files
 from qsim.checks import check_shape, check_video
-from qsim.clip.clip import Clip
-from qsim.clip.stream import Stream
 from qsim.colour import bright_end
 from qsim.files import load_array
 from qsim.formats.recording import checked_codes
 from qsim.sensor import packing
 from qsim.sensor.demosaicing import demosaic, determines_bands
+from qsim.streams.clip import Clip
+from qsim.streams.stream import Stream
 
 Picture = NDArray[np.uint8]  # [H, W, 3]
 SAMPLES = 16  # frames on which the scales of a clip are measured

@@ -18,13 +18,13 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import rms
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons
-from qsim.clip.stream import Stream
 from qsim.colour import psnr
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.sensor.defects import good_pixels
 from qsim.sensor.estimation import Response
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.stream import Stream
 
 _POINTS = 1024  # of a response: interpolation errs by less than 2e-5 of the full scale, and 12 bits take seconds
 

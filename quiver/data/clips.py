@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import check_outside
-from qsim.clip.photons import clip_photons
 from qsim.dataset.dataset import Dataset
 from qsim.files import sha256, to_json
 from qsim.optics.radiometry import WHITE_PER_MEAN
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
 
 __all__ = [
     "Clip",

@@ -19,16 +19,16 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
-from qsim.clip.clip import Clip
 from qsim.clip.lazy_array import LazyArray
-from qsim.clip.photons import clip_photons
-from qsim.clip.sensing import describe, followed
-from qsim.clip.stream import Stream
 from qsim.files import read_json, sha256, to_json, wording
 from qsim.keys import Key, hash_name
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.demosaicing import demosaic, determines_bands
 from qsim.sensor.sensor import Sensor
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.sensing import describe, followed
+from qsim.streams.stream import Stream
 from quiver.data import defects
 from quiver.data.code_table import draw_codes
 from quiver.data.illumination import Illumination

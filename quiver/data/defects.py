@@ -23,14 +23,14 @@ from numpy import ndarray as Array
 
 from qsim import files, keys
 from qsim.arrays import plain
-from qsim.clip.simulation import Draw
-from qsim.clip.stream import Stream
 from qsim.keys import Key
 from qsim.sensor.defects.defect_table import Defects as Defects
 from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.defects.good_pixels import behind, defective
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
+from qsim.streams.simulation import Draw
+from qsim.streams.stream import Stream
 
 NEIGHBOURS = 8  # good pixels that a defective one is filled from
 STAGE = 4  # of the random keys

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from qsim.clip.clip import Clip
-from qsim.clip.sensing import Sensing, prepare
-from qsim.clip.simulation import Draw
 from qsim.sensor import devices
 from qsim.sensor.defects.defect_table import Defects, from_toml
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
+from qsim.streams.clip import Clip
+from qsim.streams.sensing import Sensing, prepare
+from qsim.streams.simulation import Draw
 
 
 @dataclass(frozen=True)

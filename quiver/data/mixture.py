@@ -6,8 +6,8 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from qsim.clip.clip import Clip
-from qsim.clip.stream import Stream
+from qsim.streams.clip import Clip
+from qsim.streams.stream import Stream
 from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise, as_text, short_name
 

@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clip import Clip
-from qsim.clip.sensing import Sensing, assemble
-from qsim.clip.simulation import Draw
-from qsim.clip.stream import Stream
 from qsim.files import sha256, to_json
 from qsim.sensor import colour_filter
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.sensor import Sensor
+from qsim.streams.clip import Clip
+from qsim.streams.sensing import Sensing, assemble
+from qsim.streams.simulation import Draw
+from qsim.streams.stream import Stream
 from quiver.data.illumination import Illumination, read_sensor
 
 OTHERS = "give --sensor, --bits and --ppp, in Python WindowSettings(lights=...)"  # where a stream's noise is of no use

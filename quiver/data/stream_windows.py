@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from torch.utils.data import Dataset
 
-from qsim.clip.clip import Clip
 from qsim.keys import Key
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
+from qsim.streams.clip import Clip
 from quiver.data.codes import Codes, codes_of, light_of, open_stream, stream_codes
 from quiver.data.window_noise import WindowPlace
 from quiver.data.windows import WindowSettings, as_input, turned

@@ -19,12 +19,12 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip import manifest
-from qsim.clip.clip import Clip
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress, sha256, to_json
 from qsim.formats.detection import recordings
 from qsim.formats.images import read_pictures
 from qsim.formats.video import read_frames
+from qsim.streams.clip import Clip
 
 WINDOW = 11  # frames of a published window; one is restored
 WEIGHTS = (0.299, 0.587, 0.114)  # of red, green and blue in OpenCV's grey

@@ -15,12 +15,12 @@ from functools import lru_cache
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons
-from qsim.clip.simulation import Draw
 from qsim.keys import Key
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.simulation import Draw
 from quiver.data.code_table import draw_codes
 from quiver.data.defects import Filler, behind, defective, skips_codes
 from quiver.data.noise import Noise, stored_defects

@@ -24,12 +24,12 @@ import torch
 from numpy import ndarray as Array
 from torch.utils.data import Dataset, Sampler
 
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons
-from qsim.clip.simulation import Draw
-from qsim.clip.stream import Stream
 from qsim.keys import Key
 from qsim.sensor.sensor import Sensor
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.simulation import Draw
+from qsim.streams.stream import Stream
 from quiver.data.clips import has_sharp, open_clips, peak_of
 from quiver.data.code_table import draw_codes
 from quiver.data.codes import Codes, array_codes

@@ -18,15 +18,15 @@ from clips import write_clip
 
 from qsim import checks, files
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
-from qsim.clip.sensing import Sensing, replay, sense
-from qsim.clip.stream import Stream
 from qsim.dataset import checking, generation, recipe
 from qsim.dataset.dataset import Dataset
 from qsim.formats import exporting, importing
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints
 from qsim.report import report, views
+from qsim.streams.clip import Clip
+from qsim.streams.sensing import Sensing, replay, sense
+from qsim.streams.stream import Stream
 from qsim.structure import make, structure
 from quiver.data import codes as data
 from quiver.restoration.restored_file import restore_to_file

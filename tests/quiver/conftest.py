@@ -8,7 +8,7 @@ import pytest
 import torch
 from clips import ClipMaker, write_clip, write_dataset
 
-from qsim.clip.clip import Clip
+from qsim.streams.clip import Clip
 
 
 @pytest.hookimpl(tryfirst=True)

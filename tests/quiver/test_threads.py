@@ -16,7 +16,7 @@ from clips import ClipMaker, write_clip
 from compiled_cases import loaded_drjit
 
 import qsim.cli.program
-from qsim.clip import sensing
+from qsim.streams import sensing
 from quiver import threads
 from quiver.cli import program
 from quiver.model.unet import UNet, UNetConfig

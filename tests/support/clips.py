@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import PHYSICAL, RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.dataset.generation import Options, generate
@@ -17,6 +16,7 @@ from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe import Recipe
 from qsim.optics.camera import Camera
 from qsim.optics.radiometry import RGB
+from qsim.streams.clip import Clip
 
 ClipMaker = Callable[..., Clip]
 

@@ -14,7 +14,6 @@ from unittest import mock
 
 import numpy as np
 
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import PHYSICAL
 from qsim.clip.writer import ClipWriter
 from qsim.dataset import recipe
@@ -24,6 +23,7 @@ from qsim.dataset.job import Job
 from qsim.dataset.provenance import origin
 from qsim.optics.camera import Camera
 from qsim.scene import describe
+from qsim.streams.clip import Clip
 
 RECIPE = """[recipe]
 name = "small"

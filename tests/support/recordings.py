@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.formats import importing
 from qsim.formats.importing import Import
 from qsim.formats.recording import Hints
+from qsim.streams.clip import Clip
 
 CAPTURE = Import(frame_rate=1000.0)
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import PHYSICAL
 from qsim.clip.writer import ClipWriter
+from qsim.streams.clip import Clip
 
 FRAMES = 5
 HEIGHT = 10

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.writer import ClipWriter
+from qsim.streams.clip import Clip
 
 SIZE = (48, 64)
 

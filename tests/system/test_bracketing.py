@@ -10,9 +10,9 @@ import pytest
 import qsim.cli.program
 import quiver
 import quiver.cli.program
-from qsim.clip.clip import Clip
 from qsim.dataset import recipe
 from qsim.scenes import RECIPES
+from qsim.streams.clip import Clip
 
 
 @pytest.mark.slow  # kernels of the renderer

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from clips import sliding_pattern, write_clip
 
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons
-from qsim.clip.rows import Rows
-from qsim.clip.sensing import Sensing, replay, sense
-from qsim.clip.simulation import stored
-from qsim.clip.stream import Stream
 from qsim.dataset.redraw import redraw
 from qsim.optics.radiometry import RGB
 from qsim.sensor import QIS, BinarySPAD, CountingSPAD, Sensor, SpikeCamera
 from qsim.sensor.defects.defect_table import from_dict
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.rows import Rows
+from qsim.streams.sensing import Sensing, replay, sense
+from qsim.streams.simulation import stored
+from qsim.streams.stream import Stream
 
 RATE = 2000.0
 Drawn = tuple[Clip, Sensor, dict[str, Any]]

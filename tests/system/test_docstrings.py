@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-BOUNDARIES = ("qsim/optics", "qsim/sensor", "qsim/clip", "quiver/model")
+BOUNDARIES = ("qsim/optics", "qsim/sensor", "qsim/clip", "qsim/streams", "quiver/model")
 ARRAYS = re.compile(r"\b(Array|NDArray|ndarray|ArrayLike|Tensor)\b")
 SHAPES = re.compile(
     r"\[[^\]]+\]|\bshape\b|\bscalars?\b|\bbroadcast|\bAs `|\bSee `"

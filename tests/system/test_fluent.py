@@ -70,7 +70,7 @@ def test_a_user_gets_types(tmp_path: Path):
         [sys.executable, "-m", "mypy", "--config-file", str(ROOT / "pyproject.toml"), str(program)],
         capture_output=True, text=True, check=False, cwd=ROOT,
     )  # fmt: skip
-    for words in ('"qsim.clip.clip.Clip"', '"qsim.clip.stream.Stream"', '"float"', '"ppp" to "sense"'):
+    for words in ('"qsim.streams.clip.Clip"', '"qsim.streams.stream.Stream"', '"float"', '"ppp" to "sense"'):
         assert words in found.stdout, found.stdout
 
 

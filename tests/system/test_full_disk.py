@@ -13,13 +13,13 @@ from clips import write_clip
 from fakes import RECIPE, make, tree
 
 from qsim.cli.program import main
-from qsim.clip.sensing import Sensing, sense
 from qsim.dataset import recipe
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import Options, Summary, generate
 from qsim.dataset.job_runner import RenderJob
 from qsim.formats import exporting, importing
 from qsim.formats.exporting import Export
+from qsim.streams.sensing import Sensing, sense
 
 
 @pytest.fixture

@@ -27,9 +27,7 @@ from qsim import files
 from qsim.calibration import sensor_file
 from qsim.cli.program import main
 from qsim.clip import exr
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
-from qsim.clip.stream import Stream
 from qsim.clip.writer import ClipWriter
 from qsim.dataset import checking, recipe
 from qsim.formats import array_files, detection, images, importing, video
@@ -39,6 +37,8 @@ from qsim.scene import animated_file
 from qsim.sensor import devices
 from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.pixel_array import PixelArray
+from qsim.streams.clip import Clip
+from qsim.streams.stream import Stream
 from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes
 

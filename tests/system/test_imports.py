@@ -24,23 +24,30 @@ ROOMS: dict[str, set[str]] = {
     "qsim.optics": {"qsim"},
     "qsim.sensor": {"qsim"},
     "qsim.scene": {"qsim", "qsim.optics"},
-    "qsim.clip": {"qsim", "qsim.optics", "qsim.sensor"},
-    "qsim.rendering": {"qsim", "qsim.optics", "qsim.scene", "qsim.clip"},
-    "qsim.formats": {"qsim", "qsim.optics", "qsim.sensor", "qsim.clip", "qsim.scene"},
+    "qsim.clip": {"qsim", "qsim.optics"},
+    "qsim.streams": {"qsim", "qsim.optics", "qsim.sensor", "qsim.clip"},
+    "qsim.rendering": {"qsim", "qsim.optics", "qsim.scene", "qsim.clip", "qsim.streams"},
+    "qsim.formats": {"qsim", "qsim.optics", "qsim.sensor", "qsim.clip", "qsim.streams", "qsim.scene"},
     "qsim.scenes": {"qsim", "qsim.optics", "qsim.scene", "qsim.rendering"},
-    "qsim.dataset": {"qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.rendering", "qsim.scenes"},
-    "qsim.calibration": {"qsim", "qsim.sensor", "qsim.clip", "qsim.formats"},
-    "qsim.studies": {
-        *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.rendering", "qsim.formats"),
-        *("qsim.scenes", "qsim.dataset"),
+    "qsim.dataset": {
+        *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.streams", "qsim.rendering"),
+        *("qsim.scenes",),
     },
-    "qsim.report": {"qsim", "qsim.optics", "qsim.sensor", "qsim.clip", "qsim.formats", "qsim.dataset"},
+    "qsim.calibration": {"qsim", "qsim.sensor", "qsim.streams", "qsim.formats"},
+    "qsim.studies": {
+        *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.streams", "qsim.rendering"),
+        *("qsim.formats", "qsim.scenes", "qsim.dataset"),
+    },
+    "qsim.report": {"qsim", "qsim.optics", "qsim.sensor", "qsim.clip", "qsim.streams", "qsim.formats", "qsim.dataset"},
     "qsim.cli": {
-        *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.rendering", "qsim.formats"),
-        *("qsim.scenes", "qsim.dataset", "qsim.calibration", "qsim.studies", "qsim.report"),
+        *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.streams", "qsim.rendering"),
+        *("qsim.formats", "qsim.scenes", "qsim.dataset", "qsim.calibration", "qsim.studies", "qsim.report"),
     },
     "quiver": {"qsim"},
-    "quiver.data": {"qsim", "quiver", "qsim.optics", "qsim.sensor", "qsim.clip", "qsim.dataset", "qsim.formats"},
+    "quiver.data": {
+        *("qsim", "quiver", "qsim.optics", "qsim.sensor", "qsim.clip", "qsim.streams", "qsim.dataset"),
+        *("qsim.formats",),
+    },
     "quiver.model": {"qsim", "quiver"},
     "quiver.baselines": {"qsim", "quiver", "qsim.sensor", "quiver.data"},
     "quiver.restoration": {"qsim", "quiver", "quiver.data", "quiver.model", "quiver.baselines"},
@@ -202,7 +209,7 @@ def test_the_checker_sees_relative_nested_and_indirect_imports(tmp_path, monkeyp
 def test_importing_qsim_loads_nothing_heavy():
     """Quick to import means: none of the slow libraries, and none of ours that import them."""
     code = (
-        "import qsim, qsim.keys, qsim.sensor.qis, qsim.sensor.packing, qsim.clip.clip, qsim.optics.radiometry, sys;"
+        "import qsim, qsim.keys, qsim.sensor.qis, qsim.sensor.packing, qsim.streams.clip, qsim.optics.radiometry, sys;"
         "heavy = {'mitsuba','drjit','torch','matplotlib','skimage','trimesh','scipy.stats','jinja2'};"
         "print(sorted(heavy & set(sys.modules)))"
     )

@@ -9,11 +9,11 @@ import pytest
 
 import qsim.cli.program
 import quiver.cli.program
-from qsim.clip.clip import Clip
 from qsim.dataset import recipe
 from qsim.optics.lens import Lens
 from qsim.scene.camera_path import read_camera_path
 from qsim.scenes import RECIPES, load
+from qsim.streams.clip import Clip
 
 
 @pytest.mark.slow  # twenty seconds of rendering and of kernels

@@ -413,7 +413,7 @@ def test_a_mistake_is_one_line_that_names_the_cure(folder, monkeypatch, capsys, 
 def test_the_table_would_notice_a_traceback(folder, monkeypatch, capsys):
     """A defect of ours is no mistake of the user: it is not hidden behind one line."""
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("qsim.clip.clip.Clip.open", lambda path: 1 / 0)
+    monkeypatch.setattr("qsim.streams.clip.Clip.open", lambda path: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         told(capsys, "qsim check lit")
 
@@ -525,7 +525,7 @@ def test_too_little_memory(folder, monkeypatch, capsys):
         raise MemoryError("Unable to allocate 7 TiB")
 
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("qsim.clip.clip.Clip.open", hoard)
+    monkeypatch.setattr("qsim.streams.clip.Clip.open", hoard)
     err = told(capsys, "qsim check lit")
     assert "not enough memory (Unable to allocate 7 TiB); try fewer or smaller frames" in err
 

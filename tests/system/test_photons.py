@@ -6,9 +6,9 @@ import fakes
 import numpy as np
 
 from qsim.cli.program import main
-from qsim.clip.stream import Stream
 from qsim.dataset import generation, recipe
 from qsim.formats import photon_times
+from qsim.streams.stream import Stream
 from quiver.cli.program import main as quiver
 
 

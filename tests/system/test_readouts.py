@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.dataset import generation, recipe
 from qsim.scenes import RECIPES
+from qsim.streams.clip import Clip
 from quiver.cli.program import main as quiver
 
 TEXT = '[[scenes]]\nfamily = "text"'

@@ -14,12 +14,12 @@ from clips import write_clip
 import quiver.cli.program
 from qsim import files
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
-from qsim.clip.sensing import Sensing, sense
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset
 from qsim.formats import exporting
 from qsim.formats.exporting import Export
+from qsim.streams.clip import Clip
+from qsim.streams.sensing import Sensing, sense
 
 QUICK = ["../../../victim", "/etc/victim", {}]
 SLOW = ["..", ".", "", "a/b", "a\nb", "-x", "a\0b", "x" * 5000, "ü", "a b", "~", 7, None, []]

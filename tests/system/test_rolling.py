@@ -9,10 +9,10 @@ import pytest
 
 import qsim.cli.program
 import quiver.cli.program
-from qsim.clip.clip import Clip
-from qsim.clip.rows import Rows
 from qsim.dataset import recipe
 from qsim.scenes import RECIPES
+from qsim.streams.clip import Clip
+from qsim.streams.rows import Rows
 
 
 def shipped() -> str:

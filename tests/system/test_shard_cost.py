@@ -11,7 +11,6 @@ import pytest
 from stats import critical_z
 
 from qsim.cli.program import main as qsim
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import PHYSICAL
 from qsim.clip.writer import ClipWriter
 from qsim.dataset import cost_forecast, recipe
@@ -21,6 +20,7 @@ from qsim.dataset.job import Job
 from qsim.dataset.provenance import origin
 from qsim.optics.camera import Camera
 from qsim.scene import describe
+from qsim.streams.clip import Clip
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))

@@ -11,10 +11,10 @@ from gltf_files import arm
 import qsim.cli.program
 import quiver.cli.program
 from qsim import scenes
-from qsim.clip.clip import Clip
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
 from qsim.scenes import gltf_file
+from qsim.streams.clip import Clip
 
 CHEAP = Budget(samples=4, bounces=2)
 

@@ -7,12 +7,12 @@ from typing import Any
 
 from qsim import checks
 from qsim.checks import MAX_PIXELS
-from qsim.clip.sensing import Sensing
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe_sections.toml_section import Section
 from qsim.files import check_name
 from qsim.scene.animated.gltf_body import GLTF_SUFFIXES, animated_file, animations_in
 from qsim.scene.camera_path import PLAIN, read_camera_path
+from qsim.streams.sensing import Sensing
 from qsim.structure import Check, Table
 
 MAX_STEM = 180  # characters of a scene's name, which gets a seed, a speed and a temporary ending as a file's name

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from qsim import checks
-from qsim.clip.rows import Rows
-from qsim.clip.sensing import Sensing
 from qsim.dataset.recipe_sections.toml_section import Section, file_name
+from qsim.streams.rows import Rows
+from qsim.streams.sensing import Sensing
 from qsim.structure import Table
 
 STREAMS: Table = {

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, looks, moving_mean
+from qsim.streams.clip import Clip
 from qsim.studies.bit_depth import restored_bits
 from qsim.studies.bit_depth.clip_study import Study, StudyRow, mean_motion, study
 from qsim.studies.bit_depth.readout import MODELS, StudySettings

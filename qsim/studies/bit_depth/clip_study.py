@@ -24,13 +24,13 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import keys
-from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import CODE_PLANES, SLOWEST, looks, moving_mean, moving_pixels
-from qsim.clip.photons import clip_photons, light_level
 from qsim.colour import psnr
 from qsim.optics import radiometry
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons, light_level
 from qsim.studies.bit_depth.laws import Structure
 from qsim.studies.bit_depth.readout import GRID, Readout, StudySettings, readouts
 

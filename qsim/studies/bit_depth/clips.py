@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from qsim import keys
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import target_of
-from qsim.clip.photons import light_level
-from qsim.clip.sensing import Sensing, describe, sense, write_stream
-from qsim.clip.simulation import Draw
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.clip import Clip
+from qsim.streams.photons import light_level
+from qsim.streams.sensing import Sensing, describe, sense, write_stream
+from qsim.streams.simulation import Draw
 from qsim.studies.bit_depth.clip_study import check_clip
 from qsim.studies.bit_depth.readout import StudySettings, at_depth, plane_sensor, readouts
 

@@ -15,11 +15,11 @@ from numpy import ndarray as Array
 
 from qsim import colour, keys
 from qsim.clip.clamped_error import rms
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons, light_level
 from qsim.figures import figure_png, new_figure
 from qsim.sensor import devices
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons, light_level
 from qsim.studies.bit_depth.clip_study import check_clip, clip_motion, expose
 from qsim.studies.bit_depth.readout import Readout, StudySettings
 

@@ -11,10 +11,10 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import rms
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons
 from qsim.colour import psnr
 from qsim.files import Progress
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
 from qsim.studies.bit_depth.answer import answer, at_edge, code_motion, widened
 from qsim.studies.bit_depth.clip_study import Study, StudyRow, check_clip, scored_pixels, study
 from qsim.studies.bit_depth.clips import MovingClip

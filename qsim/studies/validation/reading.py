@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.formats import exporting
+from qsim.streams.clip import Clip
 from qsim.tables import text_table
 
 FRAMES = 65

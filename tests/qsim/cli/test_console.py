@@ -20,8 +20,8 @@ import quiver.cli.program
 from qsim.cli import console
 from qsim.cli.options import checked
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.clip.writer import ClipWriter
+from qsim.streams.clip import Clip
 
 ROOT = Path(__file__).parents[3]
 
@@ -261,7 +261,7 @@ def test_warnings_are_one_line_and_quiet_has_none(tmp_path, monkeypatch, capsys)
         return []
 
     clip = str(write_clip(tmp_path / "c", frames=2, height=8, width=10).path)
-    monkeypatch.setattr("qsim.clip.clip.Clip.verify", warned)
+    monkeypatch.setattr("qsim.streams.clip.Clip.verify", warned)
     assert main(["check", clip]) == 0
     assert capsys.readouterr().err == "qsim: warning: the light is dim\n"
     assert main(["check", clip, "--quiet"]) == 0
@@ -342,7 +342,7 @@ def test_streams_that_force_replaces_are_not_resumed_without_it(tmp_path, monkey
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("qsim.clip.sensing.sense", interrupt)
+    monkeypatch.setattr("qsim.streams.sensing.sense", interrupt)
     resumes = "the same command resumes with the missing streams"
     for words, then in (([], resumes), (["--force"], console.MAKES_AGAIN)):
         assert main(["sense", str(clip.path), "--ppp", "1", *words]) == 130

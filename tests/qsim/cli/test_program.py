@@ -19,12 +19,12 @@ import pytest
 from qsim import files
 from qsim.cli import dataset
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset
 from qsim.files import Progress
+from qsim.streams.clip import Clip
 
 COMMANDS = ("doctor", "render", "sense", "generate", "plan", "check", "convert")
 

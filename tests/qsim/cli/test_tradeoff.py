@@ -7,8 +7,8 @@ import pytest
 from waves import SIZE, wave_clip
 
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
-from qsim.clip.sensing import replay
+from qsim.streams.clip import Clip
+from qsim.streams.sensing import replay
 from qsim.studies.bit_depth import clip_study
 
 

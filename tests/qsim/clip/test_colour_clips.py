@@ -10,13 +10,13 @@ from clips import colour_clip, write_clip
 from PIL import Image
 
 from qsim.cli import main
-from qsim.clip.photons import clip_photons, light_level
 from qsim.clip.writer import ClipWriter
 from qsim.colour import from_linear
 from qsim.optics.diffraction import diffract
 from qsim.optics.radiometry import LIGHT_SPEED, PLANCK, RGB, expected_photons
 from qsim.report.explore import explore_page
 from qsim.report.views import open_source
+from qsim.streams.photons import clip_photons, light_level
 
 
 def test_bands_are_stored_as_halves_in_one_file(tmp_path):

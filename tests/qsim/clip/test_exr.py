@@ -8,8 +8,8 @@ from clips import RGB, write_clip
 from tiny_clip import meta
 
 from qsim.clip import exr
-from qsim.clip.clip import Clip
 from qsim.clip.writer import ClipWriter
+from qsim.streams.clip import Clip
 
 
 def test_the_largest_half_is_kept_and_counted(tmp_path: Path):

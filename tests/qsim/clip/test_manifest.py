@@ -9,8 +9,6 @@ import pytest
 from tiny_clip import meta, write
 
 from qsim import files
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons
 from qsim.clip.writer import ClipWriter
 from qsim.formats.exporting import camera_file
 from qsim.optics.camera import Camera
@@ -18,6 +16,8 @@ from qsim.optics.lens import Lens
 from qsim.optics.radiometry import expected_photons
 from qsim.optics.zoom import Zoom
 from qsim.scene import describe
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
 
 
 @pytest.mark.parametrize(

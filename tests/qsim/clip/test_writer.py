@@ -10,8 +10,8 @@ import pytest
 from forks import killed_at
 from tiny_clip import FRAMES, HEIGHT, WIDTH, meta, radiance, write
 
-from qsim.clip.clip import Clip
 from qsim.clip.writer import ClipWriter
+from qsim.streams.clip import Clip
 
 
 def interrupted(path: Path, *frames: int, force: bool = False, **changes: Any) -> list[int]:

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qsim.clip.sensing import Sensing
 from qsim.dataset import recipe
 from qsim.dataset.job import Job, Settings
+from qsim.streams.sensing import Sensing
 
 FILTERS = '[colour]\nmask = "rggb"\nefficiency.R = 0.4\nefficiency.G = 0.6\nefficiency.B = 0.5\n'
 MAPPED = """[sensor]

@@ -12,15 +12,15 @@ from scipy.special import gammaln
 
 from qsim import files
 from qsim.cli import program
-from qsim.clip.clip import Clip
-from qsim.clip.rows import Rows
-from qsim.clip.sensing import Sensing, prepare, sense, write_stream
-from qsim.clip.stream import Stream, write_packed
 from qsim.dataset import redraw
 from qsim.dataset.generation import Options, generate
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe import Recipe
 from qsim.sensor.qis import QIS
+from qsim.streams.clip import Clip
+from qsim.streams.rows import Rows
+from qsim.streams.sensing import Sensing, prepare, sense, write_stream
+from qsim.streams.stream import Stream, write_packed
 
 BINARY = '[sensor]\nmodel = "BinarySPAD"\npde = 0.5\ndark_count_rate = 200.0\nbits = {bits}\n'
 COUNTING = '[sensor]\nmodel = "CountingSPAD"\npde = 0.5\ndark_count_rate = 10.0\ndead_time = 3e-4\nbits = {bits}\n'

@@ -16,10 +16,10 @@ from fakes import (
     tree,
 )
 
-from qsim.clip.sensing import Sensing, sense
 from qsim.dataset import recipe
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import Options, generate
+from qsim.streams.sensing import Sensing, sense
 
 SENSOR = """[sensor]
 model = "BinarySPAD"

@@ -17,11 +17,11 @@ from recordings import everything
 from stats import assert_share
 
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons
 from qsim.formats import challenge, exporting
 from qsim.formats.exporting import Export
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
 
 SENSOR = BinarySPAD(pde=0.5, dark_count_rate=20.0)
 

@@ -11,11 +11,11 @@ import raw_planes
 from recordings import clip_of, everything
 
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.colour import to_linear
 from qsim.formats import detection, exporting, images, importing, video
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints
+from qsim.streams.clip import Clip
 
 
 def test_three_raw_layouts_of_one_size_are_not_guessed(tmp_path: Path):

@@ -17,7 +17,6 @@ from PIL import Image
 from recordings import CAPTURE, SIZES, clip_of, everything
 
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset
 from qsim.formats import exporting, importing
@@ -30,6 +29,7 @@ from qsim.scene.camera_path import read_camera_path
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import FixedPattern
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.clip import Clip
 
 
 @pytest.mark.parametrize("bits", range(1, 9))

@@ -8,15 +8,15 @@ from clips import write_clip
 from recordings import CAPTURE, random_planes
 
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
-from qsim.clip.stream import Stream
 from qsim.clip.writer import ClipWriter
 from qsim.formats import exporting, importing, video
 from qsim.formats.exporting import Export
 from qsim.formats.importing import Import
 from qsim.formats.recording import Hints
 from qsim.sensor.colour_filter import MASKS, ColourFilter
+from qsim.streams.clip import Clip
+from qsim.streams.stream import Stream
 
 
 def test_the_ball_becomes_a_clip_of_relative_light(tmp_path: Path):

@@ -8,10 +8,10 @@ import pytest
 from clips import square_clip, write_clip, write_dataset
 
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.dataset.dataset import Dataset
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.clip import Clip
 
 h5py = pytest.importorskip("h5py")
 

@@ -14,14 +14,14 @@ from scipy.stats import kstest
 from stats import assert_histogram, assert_share
 
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons
-from qsim.clip.rows import Rows
-from qsim.clip.stream import Stream
 from qsim.formats import importing, photon_times
 from qsim.formats.recording import Hints
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.rows import Rows
+from qsim.streams.stream import Stream
 
 EXPOSURE = 5e-4
 FALSE_ALARM = 1e-6

@@ -12,11 +12,11 @@ import raw_planes
 from recordings import CAPTURE, everything, random_planes
 from sdt_files import sdt_bytes
 
-from qsim.clip.sensing import Sensing, sense
 from qsim.file_order import numbered
 from qsim.formats import array_files, detection, exporting, images, importing, photon_times, video
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints, Recording
+from qsim.streams.sensing import Sensing, sense
 
 
 def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):

@@ -9,13 +9,13 @@ import pytest
 from recordings import CAPTURE, clip_of, everything
 
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.colour import code_levels, from_linear, to_linear
 from qsim.colour import luminance as linear_luminance
 from qsim.formats import exporting, importing
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints
 from qsim.formats.video import read_frames, write_video
+from qsim.streams.clip import Clip
 
 
 def test_lossless_video_is_bit_exact_and_ordinary_video_is_not(tmp_path: Path):

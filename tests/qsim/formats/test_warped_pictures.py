@@ -10,9 +10,9 @@ from PIL import Image
 from scipy import ndimage
 
 from qsim import files
-from qsim.clip.clip import Clip
 from qsim.formats import warped_pictures
 from qsim.formats.warped_pictures import Layer, Path2D, frame, layers
+from qsim.streams.clip import Clip
 from quiver.data.clips import open_clips
 
 

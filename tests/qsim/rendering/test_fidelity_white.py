@@ -17,12 +17,12 @@ from qsim.clip.clamped_error import (
     stated,
     white_in,
 )
-from qsim.clip.clip import Clip
 from qsim.colour import psnr
 from qsim.rendering.budget import Budget
 from qsim.rendering.fidelity import choose_budget, dimming, moving
 from qsim.scene import Body, Diffuse, EnvironmentImage, Glow, PointLight, RoughPlastic
 from qsim.scene.shapes import ball
+from qsim.streams.clip import Clip
 
 
 def test_a_spark_in_the_dark_gets_a_budget():

@@ -8,9 +8,9 @@ from clips import square_clip
 
 from qsim import files
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.writer import ClipWriter
+from qsim.streams.clip import Clip
 
 SHAPE = (5, 8, 11)
 

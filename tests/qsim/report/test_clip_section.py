@@ -9,14 +9,14 @@ from stats import mixture_p_value
 
 from qsim import files
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
-from qsim.clip.photons import clip_photons
-from qsim.clip.rows import Rows
-from qsim.clip.sensing import Sensing, sense
 from qsim.clip.writer import ClipWriter
 from qsim.optics.radiometry import RGB
 from qsim.report import clip_section, report
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.rows import Rows
+from qsim.streams.sensing import Sensing, sense
 
 DEVICES = {
     "dark map": '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 900.0\nbits = 2\n'

@@ -16,9 +16,9 @@ from stats import critical_z, mixture_p_value, per_check
 
 from qsim import colour
 from qsim.cli.program import main
-from qsim.clip.photons import clip_photons
 from qsim.report import explore
 from qsim.sensor import QIS, BinarySPAD, CountingSPAD
+from qsim.streams.photons import clip_photons
 
 SIZE = (40, 56)
 ADDRESSES = {  # settings of the page, and the same here: (light, frames, sensor)

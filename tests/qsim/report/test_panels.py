@@ -10,12 +10,12 @@ from sensor_files import SPAD, sensor_file
 from qsim import colour
 from qsim.cli.program import main
 from qsim.clip.clamped_error import white_in
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
-from qsim.clip.photons import clip_photons
 from qsim.clip.writer import ClipWriter
 from qsim.report import panels, views
 from qsim.sensor.colour_filter import MASKS, ColourFilter
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
 
 
 @pytest.fixture(scope="module")

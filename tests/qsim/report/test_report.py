@@ -10,10 +10,10 @@ from clips import write_clip, write_dataset
 
 from qsim import files
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.report import report
+from qsim.streams.clip import Clip
 
 
 def test_page_shows_everything_and_loads_nothing(folder):

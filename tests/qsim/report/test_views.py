@@ -6,12 +6,12 @@ from clips import square_clip, write_clip
 from qsim import colour as pictures
 from qsim import files
 from qsim.cli.program import main
-from qsim.clip.photons import clip_photons
-from qsim.clip.rows import Rows
-from qsim.clip.stream import Stream, write_packed
 from qsim.report.views import Source, open_source
 from qsim.sensor import packing
 from qsim.sensor.qis import QIS
+from qsim.streams.photons import clip_photons
+from qsim.streams.rows import Rows
+from qsim.streams.stream import Stream, write_packed
 
 
 def test_views_are_the_declared_functions_of_the_numbers(clip):

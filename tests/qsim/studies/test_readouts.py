@@ -11,10 +11,10 @@ from sensor_files import QIS as QIS_FILE
 from sensor_files import sensor_file
 
 from qsim.cli.program import main
-from qsim.clip.photons import clip_photons
-from qsim.clip.sensing import write_stream
 from qsim.sensor.qis import QIS
 from qsim.sensor.spike import SpikeCamera
+from qsim.streams.photons import clip_photons
+from qsim.streams.sensing import write_stream
 from qsim.studies.readouts import compare
 
 EXACT = QIS(quantum_efficiency=1.0, dark_current=0.0, read_noise=0.0, bits=9)

@@ -18,8 +18,8 @@ from option_rows import Acts, Refused, Row, Run, check, loudness, names, names_o
 from safetensors.numpy import load_file
 
 from qsim import figures
-from qsim.clip.sensing import Sensing, sense
 from qsim.sensor import devices
+from qsim.streams.sensing import Sensing, sense
 from quiver import threads
 from quiver.baselines import METHODS
 from quiver.cli import program

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from clips import write_dataset
 
-from qsim.clip.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing, sense
 from quiver.data.clips import open_clips
 
 

@@ -10,11 +10,11 @@ from clips import ClipMaker
 from random_codes import random_codes
 from sensor_files import COUNTER, sensor_file
 
-from qsim.clip.sensing import Sensing, sense
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.sensing import Sensing, sense
 from quiver.data.clips import open_clips, truth
 from quiver.data.codes import array_codes, frame_reader, light_of, sensed
 from quiver.data.illumination import Illumination

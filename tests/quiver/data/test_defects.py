@@ -11,11 +11,11 @@ from clips import ClipMaker
 from sensor_files import COUNTER, QIS, SPAD, sensor_file
 from stats import assert_mean
 
-from qsim.clip.sensing import Sensing, sense
 from qsim.keys import Key
 from qsim.sensor import qis
 from qsim.sensor.defects.fixed_pattern import FixedPattern, draw_maps
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.sensing import Sensing, sense
 from quiver.baselines import METHODS
 from quiver.data.codes import array_codes, filled, light_of, sensed, stream_codes
 from quiver.data.defects import Filler, read_map, skips_codes

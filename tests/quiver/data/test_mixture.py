@@ -11,8 +11,8 @@ import pytest
 from clips import ClipMaker
 from sensor_files import COUNTER, QIS, sensor_file
 
-from qsim.clip.photons import clip_photons, light_level
-from qsim.clip.sensing import Sensing, sense
+from qsim.streams.photons import clip_photons, light_level
+from qsim.streams.sensing import Sensing, sense
 from quiver.cli.program import main
 from quiver.data.clips import open_clips
 from quiver.data.illumination import Illumination

@@ -11,7 +11,7 @@ import pytest
 import torch
 from sensor_files import QIS, sensor_file
 
-from qsim.clip.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing, sense
 from quiver.data.clips import open_clips
 from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise, labels

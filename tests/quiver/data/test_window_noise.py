@@ -14,12 +14,12 @@ from numpy import ndarray as Array
 from sensor_files import COUNTER, QIS, SPAD, sensor_file
 from stats import assert_mean
 
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons, light_level
 from qsim.keys import Key
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import DarkSpread, FixedPattern
 from qsim.sensor.defects.pixel_array import PixelArray
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons, light_level
 from quiver.data.code_table import draw_codes
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination

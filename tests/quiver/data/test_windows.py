@@ -14,7 +14,7 @@ from sensor_files import QIS, sensor_file
 from stats import assert_mean
 from torch.utils.data import DataLoader
 
-from qsim.clip.photons import clip_photons, light_level
+from qsim.streams.photons import clip_photons, light_level
 from quiver.data.clips import open_clips
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from clips import ClipMaker, packed
 
-from qsim.clip.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing, sense
 
 
 @pytest.fixture

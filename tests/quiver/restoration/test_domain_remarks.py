@@ -13,11 +13,11 @@ from domains import MEASURED, cell, run, stream, weights
 from golden import published_state
 
 import quiver
-from qsim.clip.sensing import Sensing, sense
 from qsim.keys import Key
 from qsim.sensor import devices
 from qsim.sensor.colour_filter import MASKS, ColourFilter
 from qsim.sensor.qis import QIS
+from qsim.streams.sensing import Sensing, sense
 from quiver.baselines import METHODS
 from quiver.data.clips import open_clips
 from quiver.data.codes import Codes, array_codes, light_of

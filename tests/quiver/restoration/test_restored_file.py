@@ -18,9 +18,9 @@ import torch
 from forks import forked, killed_at
 from numpy import ndarray as Array
 
-from qsim.clip.sensing import Sensing, sense
 from qsim.scratch import sweep
 from qsim.sensor.qis import QIS
+from qsim.streams.sensing import Sensing, sense
 from quiver.cli.program import main
 from quiver.data.codes import Codes, array_codes, open_stream, sensed, stream_codes
 from quiver.data.illumination import Illumination

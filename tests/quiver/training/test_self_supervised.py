@@ -14,7 +14,6 @@ import torch
 from clips import write_clip
 from runs import same_weights
 
-from qsim.clip.sensing import Sensing, sense
 from qsim.keys import Key
 from qsim.sensor import devices
 from qsim.sensor.colour_filter import ColourFilter
@@ -22,6 +21,7 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
+from qsim.streams.sensing import Sensing, sense
 from quiver.baselines import moment
 from quiver.cli.program import main
 from quiver.data.codes import Codes, array_codes

@@ -15,7 +15,7 @@ from random_codes import random_codes
 from runs import TINY, same_weights, settings, tiny, tiny_settings
 from torch import Tensor
 
-from qsim.clip.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing, sense
 from quiver.data.clips import open_clips
 from quiver.data.codes import Codes
 from quiver.data.noise import noise_table

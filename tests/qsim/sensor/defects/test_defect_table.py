@@ -9,12 +9,12 @@ import pytest
 from clips import write_clip
 
 from qsim.cli import program
-from qsim.clip.photons import clip_photons
-from qsim.clip.sensing import Sensing, assemble, prepare, replay, sense
 from qsim.keys import Key, hash_name
 from qsim.sensor import devices
 from qsim.sensor.defects import defect_table, event_simulation, fixed_pattern
 from qsim.sensor.defects.pixel_array import PixelArray
+from qsim.streams.photons import clip_photons
+from qsim.streams.sensing import Sensing, assemble, prepare, replay, sense
 
 BINARY = '[sensor]\nmodel = "BinarySPAD"\npde = 0.5\ndark_count_rate = 200.0\nbits = 1\n'
 COUNTING = '[sensor]\nmodel = "CountingSPAD"\npde = 0.5\ndark_count_rate = 10.0\ndead_time = 5e-5\nbits = 3\n'

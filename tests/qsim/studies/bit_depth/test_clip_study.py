@@ -8,10 +8,10 @@ from stats import critical_z
 from waves import wave_clip
 
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.report import clip_section
+from qsim.streams.clip import Clip
 from qsim.studies.bit_depth import answer, clip_study
 from qsim.studies.bit_depth.clip_study import study
 from qsim.studies.bit_depth.readout import MODELS, StudySettings, plane_sensor

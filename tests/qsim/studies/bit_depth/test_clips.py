@@ -6,10 +6,10 @@ from clips import write_clip
 from waves import SIZE, wave_clip
 
 from qsim.cli.program import main
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons, light_level
 from qsim.dataset.redraw import redraw
 from qsim.rendering import clip_rendering, fidelity
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons, light_level
 from qsim.studies.bit_depth import clips
 from qsim.studies.bit_depth.clips import ClipShape, clips_for, group, render, write_streams
 from qsim.studies.bit_depth.readout import StudySettings

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from qsim.clip.clip import Clip
 from qsim.clip.manifest import PHYSICAL, RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.optics.camera import Camera
 from qsim.optics.radiometry import photons_per_lux
+from qsim.streams.clip import Clip
 from qsim.studies.bit_depth import paper_figures
 
 SIZE = (24, 30)

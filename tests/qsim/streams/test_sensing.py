@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from clips import write_clip
 
-from qsim.clip import stream
-from qsim.clip.clip import Clip
-from qsim.clip.sensing import Sensing, sense
+from qsim.streams import stream
+from qsim.streams.clip import Clip
+from qsim.streams.sensing import Sensing, sense
 
 FORK = multiprocessing.get_context("fork")  # everything is imported already: the processes start together
 

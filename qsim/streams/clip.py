@@ -16,13 +16,13 @@ from qsim.checks import shown
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
 from qsim.clip.manifest import RELATIVE
-from qsim.clip.rows import Rows
-from qsim.clip.sensing import Sensing, sense
-from qsim.clip.stream import Stream
 from qsim.files import Progress
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.sensor import Sensor
+from qsim.streams.rows import Rows
+from qsim.streams.sensing import Sensing, sense
+from qsim.streams.stream import Stream
 
 
 @dataclass(frozen=True, eq=False)

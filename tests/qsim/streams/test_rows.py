@@ -9,12 +9,12 @@ import pytest
 from clips import sliding_pattern, write_clip
 
 from qsim.checks import ROW_ORDERS
-from qsim.clip.rows import Rows
-from qsim.clip.sensing import Sensing, prepare, replay, sense
 from qsim.dataset.redraw import redraw
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.rows import Rows
+from qsim.streams.sensing import Sensing, prepare, replay, sense
 
 RATE = 2000.0
 COUNTER = CountingSPAD(pde=0.5, dark_count_rate=10.0, dead_time=0.0, bits=6)

@@ -16,12 +16,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import checks, files, keys, locks, scratch
-from qsim.clip import gates
 from qsim.clip.clip_folder import ClipFolder
-from qsim.clip.photons import light_level, light_line
-from qsim.clip.rows import Rows
-from qsim.clip.simulation import Draw, plane_of, same_settings, stored
-from qsim.clip.stream import Stream, orientation, write_packed, writing
 from qsim.files import Progress, check_name
 from qsim.sensor import colour_filter, devices, file_laws, packing
 from qsim.sensor.colour_filter import ColourFilter
@@ -35,6 +30,11 @@ from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
+from qsim.streams import gates
+from qsim.streams.photons import light_level, light_line
+from qsim.streams.rows import Rows
+from qsim.streams.simulation import Draw, plane_of, same_settings, stored
+from qsim.streams.stream import Stream, orientation, write_packed, writing
 
 
 @dataclass(frozen=True)

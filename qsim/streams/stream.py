@@ -21,15 +21,15 @@ from numpy import ndarray as Array
 
 from qsim import colour, files, locks, structure
 from qsim.checks import file_path
-from qsim.clip import gates
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
 from qsim.clip.lazy_array import LazyArray
-from qsim.clip.photons import clip_photons
-from qsim.clip.rows import Rows, from_dict
 from qsim.files import VERSION, Progress
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.sensor import packing
+from qsim.streams import gates
+from qsim.streams.photons import clip_photons
+from qsim.streams.rows import Rows, from_dict
 
 if TYPE_CHECKING:
     from qsim.sensor.colour_filter import ColourFilter

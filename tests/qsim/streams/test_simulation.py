@@ -9,11 +9,6 @@ import pytest
 from clips import sliding_pattern, write_clip
 from compiled_cases import needs_engine
 
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons
-from qsim.clip.rows import Rows
-from qsim.clip.sensing import Sensing, describe, prepare, replay, sense, write_stream
-from qsim.clip.simulation import stored
 from qsim.sensor import packing
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.defect_table import Defects
@@ -22,6 +17,11 @@ from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.rows import Rows
+from qsim.streams.sensing import Sensing, describe, prepare, replay, sense, write_stream
+from qsim.streams.simulation import stored
 
 
 @pytest.fixture

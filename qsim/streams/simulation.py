@@ -17,11 +17,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip import gates
 from qsim.clip.clip_folder import ClipFolder
-from qsim.clip.photons import clip_photons
-from qsim.clip.rows import Rows
-from qsim.clip.stream import Stream
 from qsim.files import Progress
 from qsim.keys import Key
 from qsim.optics.radiometry import Crop, LightLevel
@@ -36,6 +32,10 @@ from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
+from qsim.streams import gates
+from qsim.streams.photons import clip_photons
+from qsim.streams.rows import Rows
+from qsim.streams.stream import Stream
 
 LAWS = ("table", "process", "planes", "closed form", "events", "spikes")  # of `Draw.law`
 UNEVEN = 0.01  # of the mean strength of a light, a difference that is stated

@@ -7,9 +7,6 @@ import pytest
 from clips import write_clip
 from stats import assert_mean
 
-from qsim.clip import gates
-from qsim.clip.rows import Rows
-from qsim.clip.sensing import Sensing, prepare, replay, sense
 from qsim.dataset.redraw import redraw
 from qsim.formats.challenge import bands_of
 from qsim.sensor.counting import CountingSPAD
@@ -17,6 +14,9 @@ from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import FixedPattern
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams import gates
+from qsim.streams.rows import Rows
+from qsim.streams.sensing import Sensing, prepare, replay, sense
 from qsim.studies.readouts import compare
 
 SCHEDULE = (1.0, 0.25, 0.0625)

@@ -7,10 +7,10 @@ import pytest
 from tiny_clip import FRAMES, write
 
 from qsim.clip.manifest import RELATIVE
-from qsim.clip.photons import clip_photons, light_level, light_line
-from qsim.clip.sensing import Sensing, replay, sense
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.photons import clip_photons, light_level, light_line
+from qsim.streams.sensing import Sensing, replay, sense
 
 
 def test_photons_of_a_crop_are_the_crop_of_the_photons(tmp_path: Path):

@@ -8,11 +8,6 @@ from clips import colour_clip, write_clip
 from PIL import Image
 
 from qsim.cli import main
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons
-from qsim.clip.rows import Rows
-from qsim.clip.sensing import Sensing, assemble, prepare, replay, sense
-from qsim.clip.simulation import stored
 from qsim.dataset.recipe import load
 from qsim.dataset.redraw import redraw
 from qsim.keys import Key, hash_name
@@ -20,6 +15,11 @@ from qsim.optics.radiometry import RGB
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.rows import Rows
+from qsim.streams.sensing import Sensing, assemble, prepare, replay, sense
+from qsim.streams.simulation import stored
 
 SENSOR = """
 [sensor]

@@ -7,16 +7,16 @@ import pytest
 import tiny_clip
 from clips import write_clip
 
-from qsim.clip.clip import Clip
-from qsim.clip.photons import clip_photons
-from qsim.clip.sensing import Sensing, sense
-from qsim.clip.stream import Stream, write_packed
 from qsim.sensor import packing
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import FixedPattern
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons
+from qsim.streams.sensing import Sensing, sense
+from qsim.streams.stream import Stream, write_packed
 
 SENSOR = QIS(0.7, 2.0, 0.3, 3, gain=0.8)
 
