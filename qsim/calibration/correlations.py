@@ -135,18 +135,28 @@ def _shown(stack: FrameStatistics) -> float:
     The cause N counts without limit, and the effect shows in codes c below the top: P(c < top) Cov(c, N) / Var(c). The
     counts that the top code hides are those of a Poisson law of the same mean code.
     """
-    from scipy.special import pdtr
-
     top = stack.histogram.size - 1
     full = float(stack.histogram[-1] / stack.histogram.sum())
     if full == 0:
         return 1.0
-    counts = np.linspace(0.0, 3.0 * np.sqrt(top + 1), 400)[1:] ** 2
-    above = 1 - pdtr(np.arange(top), counts[:, None])  # P(N > k)
-    codes = above.sum(axis=1)
-    hidden = np.interp(stack.mean, codes, (counts - codes) / np.maximum(above[:, -1], 1e-300))
-    ratio = 1 + (top - stack.mean) * full * float(hidden) / max(stack.variance, 1e-12)
+    ratio = 1 + (top - stack.mean) * full * _hidden(stack.mean, top) / max(stack.variance, 1e-12)
     return max((1 - full) * ratio, _LEAST)
+
+
+def _hidden(mean: float, top: int) -> float:
+    """Return the counts above `top` that a full code hides in the mean, of Poisson counts N of this mean code.
+
+    E[N - top | N >= top] = x - top P(N > top) / P(N >= top) at x arrivals. These are upper tails of a Poisson law: where
+    few codes are full, one minus the cdf is rounding alone. Below their smallest number the ratio has its limit for
+    little light, x / (top + 1).
+    """
+    from scipy.special import pdtrc
+
+    arrivals = np.linspace(0.0, 3.0 * np.sqrt(top + 1), 400)[1:] ** 2
+    above = pdtrc(np.arange(top), arrivals[:, None])  # P(N > k)
+    full = above[:, -1]
+    ratio = np.divide(pdtrc(top, arrivals), full, out=arrivals / (top + 1), where=full > 1e-200)
+    return float(np.interp(mean, above.sum(axis=1), arrivals - top * ratio))
 
 
 def _crosstalk(stack: FrameStatistics, bits: int, value: float) -> _Pairs | None:
