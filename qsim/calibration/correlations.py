@@ -146,9 +146,9 @@ def _shown(stack: FrameStatistics) -> float:
 def _hidden(mean: float, top: int) -> float:
     """Return the counts above `top` that a full code hides in the mean, of Poisson counts N of this mean code.
 
-    E[N - top | N >= top] = x - top P(N > top) / P(N >= top) at x arrivals. These are upper tails of a Poisson law: where
-    few codes are full, one minus the cdf is rounding alone. Below their smallest number the ratio has its limit for
-    little light, x / (top + 1).
+    E[N - top | N >= top] = x - top P(N > top) / P(N >= top) at x arrivals. These are upper tails of a Poisson law:
+    where few codes are full, one minus the cdf is rounding alone. Below their smallest number the ratio has its limit
+    for little light, x / (top + 1).
     """
     from scipy.special import pdtrc
 

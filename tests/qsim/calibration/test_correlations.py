@@ -5,6 +5,7 @@ from __future__ import annotations
 import mpmath
 import numpy as np
 import pytest
+
 from qsim.calibration import correlations
 from qsim.calibration.frame_statistics import measure
 
