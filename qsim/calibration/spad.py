@@ -28,10 +28,11 @@ from qsim.calibration.goodness import NODES, WEIGHTS, goodness
 from qsim.calibration.prnu import BY_DARK, BY_FLAT, Flat, hot_by_rate, measure_pattern, outliers, smooth_part, surface
 from qsim.calibration.quantiles import chi2_quantile
 from qsim.calibration.results import Z95, Calibration, Value, odd_efficiency, poisson_interval
-from qsim.calibration.spad_response import NEIGHBOURS, Response
+from qsim.calibration.spad_response import NEIGHBOURS, Response, over_neighbours
 
 NO_EVENT_BOUND = -log(0.025)  # expected events at which none occurs in 2.5 % of the cases: end of a two-sided 95 %
 FEW_COUNTS = 100  # from here on a normal interval differs from the exact one by about a tenth of its half-width
+_LIT = 0.05  # of a typical pixel's counts, due to hot neighbours, above which its rate is not known
 NEARLY_SATURATED = 50.0  # counts missing to saturation, below which a pixel's rate has an exact interval of its own
 
 
@@ -141,9 +142,23 @@ class _Array:
                 hot |= outliers(level)
             return replace(self, hot=hot)
         dark = dark_rates(self.darks, self.response)
-        found = _distribution(dark)
+        everywhere = np.ones_like(self.hot)
+        found = _distribution(dark, everywhere)
         hot = hot_by_rate(dark.counts, found.median * dark.time) | dark.saturated
+        lit = self._lit_by_hot(dark, hot, found.median * dark.time)
+        if lit.any() and not lit.all():
+            found = _distribution(dark, ~lit)
+            hot = hot_by_rate(dark.counts, found.median * dark.time) | dark.saturated
         return replace(self, dark=dark, found=found, hot=hot)
+
+    def _lit_by_hot(self, dark: DarkRates, hot: Array, median: float) -> Array:
+        """Return the pixels [H, W] that crosstalk of hot neighbours gives a good part of `median` counts.
+
+        A hot pixel may fire more often than its code can tell, so what its neighbours owe to it is not known. They are
+        left out of the law of rates, whatever their own rate is.
+        """
+        owed = over_neighbours(np.where(hot, dark.counts, 0.0)) * self.response.crosstalk
+        return np.asarray(owed > _LIT * max(median, 0.0))
 
     @property
     def good(self) -> Array:
@@ -226,13 +241,13 @@ def _shape(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics]) -
 # Dark rates
 
 
-def _distribution(dark: DarkRates) -> Distribution:
-    """Return the distribution of the dark rates over pixels."""
-    limit = 10 * max(float(np.median(dark.counts)), 1.0) + 10
-    bulk = dark.counts <= limit
+def _distribution(dark: DarkRates, kept: Array) -> Distribution:
+    """Return the distribution of the dark rates over the pixels in `kept`, bool [H, W]."""
+    limit = 10 * max(float(np.median(dark.counts[kept])), 1.0) + 10
+    bulk = (dark.counts <= limit) & kept
     counts = float(dark.counts[bulk].sum())
     spread = float((dark.variance[bulk] * dark.time**2).sum()) / counts if counts > 0 else 1.0
-    return distribution(Counts(dark.counts.ravel(), dark.time, max(spread, 0.05), dark.saturated.ravel()))
+    return distribution(Counts(dark.counts[kept], dark.time, max(spread, 0.05), dark.saturated[kept]))
 
 
 def _dark_values(array: _Array) -> dict[str, Value]:

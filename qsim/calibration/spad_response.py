@@ -146,7 +146,7 @@ class Response:
         found = found + np.log1p(-self.afterpulsing * mean)
         if self.crosstalk:
             fired = self.before_crosstalk(mean)
-            found = found + _over_neighbours(np.log1p(-self.crosstalk * fired))
+            found = found + over_neighbours(np.log1p(-self.crosstalk * fired))
         lever = (1 - self.afterpulsing) / (1 - self.afterpulsing * mean)
         slope = (1 - stack.mean) / lever[0, 0] if lever.size == 1 else (1 - stack.mean) / float(lever.mean())
         return Arrivals(found, variance * lever**2 * self.excess(mean), slope)
@@ -171,7 +171,7 @@ class Response:
         curvature = np.interp(found, arrivals, np.gradient(slope_table, arrivals))
         found = found + 0.5 * curvature / slopes**3 * variance
         if self.crosstalk:
-            found = found - self.crosstalk * (_over_neighbours(mean) - NEIGHBOURS * mean)
+            found = found - self.crosstalk * (over_neighbours(mean) - NEIGHBOURS * mean)
         return Arrivals(found, variance / slopes**2, float(np.interp(at, arrivals, slope_table)))
 
     def _counter(self, bits: int) -> CountingSPAD:
@@ -193,7 +193,7 @@ def _mean_count(sensor: CountingSPAD, arrivals: Array) -> Array:
     return np.asarray((1 - sensor.cdf(np.maximum(arrivals, 0.0), 1.0)).sum(axis=-1))
 
 
-def _over_neighbours(image: Array) -> Array:
+def over_neighbours(image: Array) -> Array:
     """Return the sum over the four neighbours of every pixel [H, W]; pixels of the border have fewer."""
     total = np.zeros_like(image)
     total[1:] += image[:-1]
