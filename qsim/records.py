@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -106,6 +106,8 @@ def _words(hint: Any) -> str:
         return f"{'a whole number' if bare is int else 'a number'}{_span(bounds)}"
     if dataclasses.is_dataclass(bare) or origin is dict or bare is dict:
         return "a table of values"
+    if origin is Callable:
+        return "a function"
     return f"a {getattr(bare, '__name__', bare)}"
 
 
@@ -248,6 +250,8 @@ def _settled(value: Any, hint: Any) -> Any:
     alternatives = []
     for member in members_of(hint):
         bare = _bare(member)
+        if get_origin(bare) is Callable and callable(value):
+            return value
         if isinstance(bare, type) and get_origin(bare) is None and not _is_plain(bare):
             classes.append(bare)
         else:

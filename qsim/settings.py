@@ -9,12 +9,20 @@ Options, keys of recipes, Python arguments, stored descriptions and the tables o
 from __future__ import annotations
 
 import dataclasses
+import functools
+import inspect
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass
-from typing import Annotated, Any, get_args, get_origin
+from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
 
 from msgspec import Meta
 
 from qsim import records
+
+Fields = ParamSpec("Fields")
+Record = TypeVar("Record")
+Owner = TypeVar("Owner")
+Answer = TypeVar("Answer")
 
 
 def setting(
@@ -105,6 +113,30 @@ def given(record: Any) -> dict[str, Any]:
     """
     names = {setting.name for setting in settings_of(type(record))}
     return {name: value for name, value in records.plain(record).items() if name in names}
+
+
+def taking(
+    kind: Callable[Fields, Record],
+) -> Callable[[Callable[[Owner, Record], Answer]], Callable[Concatenate[Owner, Fields], Answer]]:
+    """Let a method of one record be called with the fields of the record: `clip.sense("spad512s", ppp=3.25)`.
+
+    The fields keep their types, so that a checker of types and an editor know them, and are named in the record alone.
+    """
+
+    def wrapped(method: Callable[[Owner, Record], Answer]) -> Callable[Concatenate[Owner, Fields], Answer]:
+        @functools.wraps(method)
+        def called(owner: Owner, /, *args: Fields.args, **fields: Fields.kwargs) -> Answer:
+            return method(owner, kind(*args, **fields))
+
+        owner = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
+        hints = get_type_hints(kind)
+        parameters = [each.replace(annotation=hints[name]) for name, each in inspect.signature(kind).parameters.items()]
+        called.__signature__ = inspect.signature(method).replace(  # type: ignore[attr-defined]  # what `help` shows
+            parameters=[owner, *parameters]
+        )
+        return called
+
+    return wrapped
 
 
 def _declaration(hint: Any) -> Meta | None:

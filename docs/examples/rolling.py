@@ -16,7 +16,6 @@ import qsim
 from qsim import CountingSPAD
 from qsim.scene import Body, Camera, Constant, Diffuse, Scene, Translation
 from qsim.scene.shapes import sheet
-from qsim.streams.rows import Rows
 
 side, rate, per_code = 64, 16_000, 8  # tests: 16, 16_000, 4
 wall = Body("wall", sheet(4, 4), Diffuse(0.2))
@@ -32,7 +31,7 @@ clip = qsim.render(scene, frames=2 * per_code, frame_rate=rate, psnr=32)
 
 sensor = CountingSPAD(pde=0.6, dark_count_rate=50.0, dead_time=0.0, bits=8)
 delay = per_code / rate / side
-rolling = clip.sense(sensor, ppp=60, slices=per_code, rows=Rows(delay), name="rolling")
+rolling = clip.sense(sensor, ppp=60, slices=per_code, row_delay=delay, name="rolling")
 at_once = clip.sense(sensor, ppp=60, slices=per_code, name="at_once")
 figure, axes = plt.subplots(1, 4, figsize=(10, 2.8), layout="constrained")
 truths = rolling.truth(0, 1)[0], rolling.truth(0, 1, at="frame")[0]

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from typing import Any, NamedTuple
 
+from qsim.settings import settings_of
 from qsim.structure import table_of
 from qsim.tables import text_table
 
@@ -133,11 +134,12 @@ def model_keys(model: str) -> list[Key]:
 
 
 def fields_of(kind: type) -> dict[str, str]:
-    """Return the comments behind the fields of a dataclass, those of its bases first."""
+    """Return the meanings of the fields of a dataclass: what settings say, else the comments behind them."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         if dataclasses.is_dataclass(base):
             found |= _comments(base)
+    found |= {setting.name: setting.help_with_default for setting in settings_of(kind)}
     return {field.name: found.get(field.name, "") for field in dataclasses.fields(kind) if field.init}
 
 

@@ -82,7 +82,6 @@ def add_sense(sub: Any) -> None:
 
 
 def _run_sense(args: argparse.Namespace) -> int:
-    from qsim.streams.rows import Rows
     from qsim.streams.sensing import Sensing, sense
 
     if args.force:
@@ -94,7 +93,6 @@ def _run_sense(args: argparse.Namespace) -> int:
         raise ValueError(f"--name {args.name}: one name for {len(levels)} light levels; leave it out")
     if args.replay and len(levels) > 1:
         raise ValueError(f"--replay {args.replay}: is of one stream, not of {len(levels)} light levels; give one")
-    rows = Rows.of(args.row_delay, args.row_order)
     wanted = [
         Sensing(
             args.sensor or "quiver-physical",
@@ -105,7 +103,8 @@ def _run_sense(args: argparse.Namespace) -> int:
             diffraction=args.diffraction,
             defects=args.defects,
             slices=args.slices,
-            rows=rows,
+            row_delay=args.row_delay,
+            row_order=args.row_order,
             colour=args.colour,
             exposures=args.exposures,
             follow=args.follow,

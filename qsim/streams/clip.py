@@ -7,22 +7,28 @@ clip[5], stream[5]      one frame: radiance, codes
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 
 from qsim import colour as pictures
 from qsim import files
-from qsim.checks import shown
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
 from qsim.clip.manifest import RELATIVE
 from qsim.files import Progress
-from qsim.sensor.colour_filter import ColourFilter
-from qsim.sensor.defects.defect_table import Defects
+from qsim.kinds import Text
 from qsim.sensor.sensor import Sensor
-from qsim.streams.rows import Rows
+from qsim.settings import taking
 from qsim.streams.sensing import Sensing, sense
 from qsim.streams.stream import Stream
+
+
+@dataclass(frozen=True)
+class _Asked(Sensing):
+    """What `Clip.sense` takes: the settings of a stream, with a sensor to begin with, and how it is made."""
+
+    sensor: Text | Sensor = "quiver-physical"
+    force: bool = field(default=False, kw_only=True)
+    progress: Progress | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,46 +57,19 @@ class Clip(ClipFolder):
         """
         return Film.of(self.name, self._frames, start, stop, fps)
 
-    def sense(
-        self,
-        sensor: str | os.PathLike[str] | Sensor = "quiver-physical",
-        *,
-        ppp: float | None = None,
-        lux: float | None = None,
-        bits: int | None = None,
-        seed: int = 0,
-        name: str | None = None,
-        group: bool = False,
-        diffraction: bool = False,
-        defects: str | os.PathLike[str] | Defects | None = None,
-        slices: int = 1,
-        rows: Rows | None = None,
-        colour: str | os.PathLike[str] | ColourFilter | None = None,
-        exposures: tuple[float, ...] | None = None,
-        follow: bool = False,
-        temperature: float | None = None,
-        pixel_pitch: float | None = None,
-        force: bool = False,
-        progress: Progress | None = None,
-    ) -> Stream:
+    @taking(_Asked)
+    def sense(self, asked: _Asked) -> Stream:
         """Return the codes of a sensor that sees this clip; the stream is stored in the clip's folder.
 
         `sensor` is a record such as `QIS(...)`, a name of `qsim doctor --devices`, or a .toml file. `ppp` is the mean
         of photons per pixel and code over the clip, `lux` [lx] the light at 555 nm instead; with neither, the clip's
         own light is used. `pixel_pitch` [m] lets a clip without a camera have lux. A colour clip needs colour filters,
         as in `colour="rggb"`. `Sensing` describes the other settings. A stream of equal settings is not drawn
-        again. `ValueError` for settings that do not fit the clip; `FileExistsError` where `name` is taken by others.
+        again; `force` replaces one of other settings. `progress(done, total)` is called as codes are drawn.
+        `ValueError` for settings that do not fit the clip; `FileExistsError` where `name` is taken by others.
         """
-        if not isinstance(sensor, Sensor | str | os.PathLike):
-            raise ValueError(f"sensor is a sensor record, a name or a .toml file, got {shown(sensor)}")
-        chosen = sensor if isinstance(sensor, Sensor) else os.fspath(sensor)
-        defects = os.fspath(defects) if isinstance(defects, os.PathLike) else defects
-        colour = os.fspath(colour) if isinstance(colour, os.PathLike) else colour
-        light = (chosen, bits, ppp, lux, seed, name)
-        wanted = Sensing(
-            *light, group, diffraction, defects, slices, rows, colour, exposures, follow, temperature, pixel_pitch
-        )
-        return self.stream(sense(self, wanted, force=force, progress=progress)[0].name)
+        wanted = Sensing(**{each.name: getattr(asked, each.name) for each in fields(Sensing)})
+        return self.stream(sense(self, wanted, force=asked.force, progress=asked.progress)[0].name)
 
     @property
     def streams(self) -> tuple[str, ...]:

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import checks
+from qsim import records
+from qsim.kinds import Positive, RowOrder
 from qsim.optics.radiometry import Crop
 
 Read = Callable[[int, Crop], Array]  # clip frame, crop (y, x, height, width) -> light [h, w]
@@ -30,22 +31,11 @@ Read = Callable[[int, Crop], Array]  # clip frame, crop (y, x, height, width) ->
 class Rows:
     """A rolling readout: each row (or column) begins `delay` seconds after the one before it."""
 
-    delay: float  # s
-    order: str = "down"  # right and left: columns
+    delay: Positive  # s
+    order: RowOrder = "down"  # right and left: columns
 
     def __post_init__(self) -> None:
-        for name, check in (("delay", checks.positive), ("order", checks.row_order)):
-            try:
-                check(getattr(self, name))
-            except ValueError as error:
-                raise ValueError(f"row {name}: {error}") from None
-
-    @classmethod
-    def of(cls, delay: float | None, order: str | None) -> Rows | None:
-        """Return the readout of two options; None without a delay. `ValueError` for an order without a delay."""
-        if delay is None and order is not None:
-            raise ValueError(f"row order {order}: orders rows that have their own time; give the row delay too")
-        return None if delay is None else cls(delay, order or "down")
+        records.settle(self)
 
     def __str__(self) -> str:
         """Return the readout in words: `each row 2e-06 s later, down`."""
@@ -128,7 +118,4 @@ class Rows:
 
 def from_dict(value: dict[str, Any], where: str) -> Rows:
     """Return the record that a stream's description holds; `ValueError` names `where` if it is damaged."""
-    try:
-        return Rows(**value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: {error}") from None
+    return records.convert(value, Rows, where)

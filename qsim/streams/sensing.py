@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import numpy as np
 from numpy import ndarray as Array
 
-from qsim import checks, files, keys, locks, scratch
+from qsim import files, keys, locks, records, scratch
 from qsim.clip.clip_folder import ClipFolder
 from qsim.files import Progress, check_name
+from qsim.kinds import Bits, Frames, Light, Name, Number, Positive, RowOrder, Schedule, Seed, Text
 from qsim.sensor import colour_filter, devices, file_laws, packing
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.counting import CountingSPAD
@@ -30,6 +31,7 @@ from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
+from qsim.settings import setting
 from qsim.streams import gates
 from qsim.streams.photons import light_level, light_line
 from qsim.streams.rows import Rows
@@ -39,30 +41,90 @@ from qsim.streams.stream import Stream, orientation, write_packed, writing
 
 @dataclass(frozen=True)
 class Sensing:
-    """The settings of a stream: sensor, light level, seed; independent of the clip."""
+    """The settings of a stream: sensor, light level, seed; independent of the clip.
 
-    sensor: str | Sensor  # a name of qsim.devices, a .toml file, or a record
-    bits: int | None = None  # None: the device's own
-    ppp: float | None = None  # mean photons per pixel and code over the clip; neither ppp nor lux: factor 1
-    lux: float | None = None  # faceplate lux at 555 nm
-    seed: int = 0
-    name: str | None = None  # of the stream; made from the rest if None
-    group: bool = False  # a code sums 2^bits - 1 binary planes, each its own clip frame
-    diffraction: bool = False  # blur by the lens's Airy pattern
-    defects: str | Defects | None = None  # .toml with a table [defects]; None: that of the sensor's file, if it has one
-    slices: int = 1  # clip frames in one exposure of a counting SPAD or a QIS, for light that changes within it
-    rows: Rows | None = None  # rows or columns at their own time; None: all at once
-    colour: str | ColourFilter | None = None  # rggb, quad, rgbw or .toml with a table [colour]; None: as for defects
-    exposures: tuple[float, ...] | None = None  # shares of a code's time, in turn; None: all of it
-    follow: bool = False  # counting SPAD: draw photon by photon, even where the closed form is exact
-    temperature: float | None = None  # degrees C of a sensor file with dark_doubling; None: that of the file
-    pixel_pitch: float | None = None  # m, of a clip without a camera: lux need it
+    `ValueError` for values out of their bounds, and for settings that exclude each other.
+    """
+
+    sensor: Annotated[Text | Sensor, setting("a name of `qsim doctor --devices`, or a .toml file")]
+    bits: Annotated[Bits | None, setting("bits per code", unset="the sensor's own", varied=True)] = None
+    ppp: Annotated[
+        Light | None,
+        setting("mean photons per pixel and code over the clip", unset="the clip's own light", varied=True),
+    ] = None
+    lux: Annotated[Light | None, setting("faceplate lux at 555 nm, instead of ppp", unit="lx", varied=True)] = None
+    seed: Annotated[Seed, setting("seed of the noise")] = 0
+    name: Annotated[Name | None, setting("name of the stream", unset="made from sensor, bits and light", short="o")] = (
+        None
+    )
+    group: Annotated[bool, setting("sum 2^bits - 1 clip frames, as binary planes, to one code")] = False
+    diffraction: Annotated[bool, setting("blur light with the lens's Airy pattern")] = False
+    defects: Annotated[
+        Text | Defects | None,
+        setting(
+            "table [defects]: hot and dead pixels, PRNU, offsets, measured maps, afterpulses, crosstalk, dead time "
+            "that is carried over",
+            unset="that of the sensor's own .toml file",
+            shown="FILE.toml",
+            recipe=False,
+        ),
+    ] = None
+    slices: Annotated[
+        Frames,
+        setting("counting SPAD or QIS: clip frames per exposure, so that light may change within it (motion blur)"),
+    ] = 1
+    row_delay: Annotated[
+        Positive | None, setting("seconds from one row, or column, to the next", unit="s", unset="all at once")
+    ] = None
+    row_order: Annotated[
+        RowOrder | None, setting("direction of rows (down or up), or of columns (right or left)", unset="down")
+    ] = None
+    colour: Annotated[
+        Text | ColourFilter | None,
+        setting(
+            "colour filters: rggb, quad, rgbw, red, green, blue, or a .toml with a table [colour]",
+            unset="those of the sensor's own .toml file",
+            shown="MASK",
+        ),
+    ] = None
+    exposures: Annotated[
+        Schedule | None,
+        setting(
+            "shares of a code's time with light, in turn, as in 1,0.25,0.0625; light levels are of full exposures",
+            unset="all of it",
+        ),
+    ] = None
+    follow: Annotated[bool, setting("counting SPAD: draw photon by photon, so that their times are known")] = False
+    temperature: Annotated[
+        Number | None,
+        setting("degrees C of a sensor file with dark_doubling", unit="degrees C", unset="the file's own"),
+    ] = None
+    pixel_pitch: Annotated[
+        Positive | None,
+        setting(
+            "metres, of a clip without a camera (imported video), so that its lux are known: 1.1e-6",
+            unit="m",
+            recipe=False,
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
-        """Replace numbers of NumPy, which JSON cannot hold, by those of Python."""
-        for name, value in list(vars(self).items()):
-            if isinstance(value, np.generic):
-                object.__setattr__(self, name, value.item())
+        for name in ("sensor", "defects", "colour"):
+            value = getattr(self, name)
+            if isinstance(value, os.PathLike):
+                object.__setattr__(self, name, os.fspath(value))
+        records.settle(self)
+        if self.ppp is not None and self.lux is not None:
+            raise ValueError("give the light level as ppp or as lux, not both")
+        if self.group and self.slices != 1:
+            raise ValueError("group sums planes, slices are of one exposure; give one of them")
+        if self.row_order is not None and self.row_delay is None:
+            raise ValueError(f"row_order {self.row_order}: orders rows that have their own time; give row_delay too")
+
+    @property
+    def rows(self) -> Rows | None:
+        """The readout of rows or columns at their own time; None: all at once."""
+        return None if self.row_delay is None else Rows(self.row_delay, self.row_order or "down")
 
     @property
     def stream_name(self) -> str:
@@ -135,11 +197,8 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     """Return the draw of a clip as `prepare`, with given defects. A given sensor `own` has no file and no filters."""
     filters = _fitting_filters(clip, sensing, own is not None)
     planes = sensing.planes
-    if sensing.group:
-        if sensing.depth is None:
-            raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in --bits 3")
-        if sensing.slices != 1:
-            raise ValueError(f"{clip.name}: --group sums planes, --slices are of one exposure; give one of them")
+    if sensing.group and sensing.depth is None:
+        raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in --bits 3")
     if not 1 <= planes <= len(clip):
         what = f"one code of {planes} planes" if sensing.group else f"one exposure of {planes} slices"
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
@@ -163,12 +222,11 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
         sensor = PixelArray.of(found, sensor, *clip.shape[1:], clip.origin).sensor
     _check_planes(sensor, sensing, clip)
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
-    if not 0 <= key.seed < 2**64:
-        raise ValueError(f"{clip.name}: the seed must be a whole number from 0 to 2^64 - 1, got {key.seed}")
     plane = plane_of(sensor, planes)
-    shares = None if sensing.exposures is None else _checked_exposures(sensing, sensor, found)
+    if sensing.exposures is not None:
+        _check_exposures(sensing, sensor, found)
     draw = Draw(sensor, plane, level, key, planes, sensing.diffraction, found, rows=sensing.rows, colour=filters)
-    return dataclasses.replace(draw, shares=shares, origin=clip.origin)
+    return dataclasses.replace(draw, shares=sensing.exposures, origin=clip.origin)
 
 
 def _wavelength(clip: ClipFolder) -> float | None:
@@ -190,12 +248,8 @@ def _by_curve(filters: ColourFilter, clip: ClipFolder, sensing: Sensing) -> Colo
     return dataclasses.replace(filters, efficiency={colour: passed[colour] for colour in "".join(filters.mask)})
 
 
-def _checked_exposures(sensing: Sensing, sensor: Sensor, found: Defects | None) -> tuple[float, ...]:
-    """Return the schedule of exposures; `ValueError` if it is none, or if pixels remember the exposure before."""
-    try:
-        shares = checks.shares(sensing.exposures)
-    except ValueError as error:
-        raise ValueError(f"exposures: {error}") from None
+def _check_exposures(sensing: Sensing, sensor: Sensor, found: Defects | None) -> None:
+    """Raise `ValueError` if pixels remember the exposure before, so that all must be equal."""
     remembers = found is not None and (found.afterpulse or found.carry_dead_time)
     if isinstance(sensor, SpikeCamera):
         raise ValueError(f"exposures: {sensing.sensor_name} integrates without a pause; leave them out")
@@ -206,21 +260,22 @@ def _checked_exposures(sensing: Sensing, sensor: Sensor, found: Defects | None) 
             else f"{'followed photons' if sensing.follow else 'slices'} of a counting pixel"
         )
         raise ValueError(f"exposures: {what} need codes of equal exposure; leave one of them out")
-    return shares
 
 
 def frames_needed(sensing: Sensing, height: int, width: int, frame_rate: float) -> int:
     """Return the clip frames of the first code: its planes or slices, and those that its last row still needs."""
-    return sensing.planes + (0 if sensing.rows is None else sensing.rows.reach(height, width, frame_rate))
+    rows = sensing.rows
+    return sensing.planes + (0 if rows is None else rows.reach(height, width, frame_rate))
 
 
 def _check_rows(sensing: Sensing, clip: ClipFolder, period: int) -> None:
     """Raise `ValueError` if rows cannot be read at their times: planes or codes of `period` clip frames."""
-    assert sensing.rows is not None
+    rows = sensing.rows
+    assert rows is not None
     _, height, width = clip.shape
     if clip.exposure < 0.999 / clip.frame_rate:
         raise ValueError(f"{clip.name}: rows at their own time need a clip whose shutter is open all the time")
-    sensing.rows.check(height, width, clip.frame_rate, period, clip.name)
+    rows.check(height, width, clip.frame_rate, period, clip.name)
     needed = frames_needed(sensing, height, width, clip.frame_rate)
     if len(clip) < needed:
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for one code, whose last row needs {needed}")

@@ -16,7 +16,6 @@ from qsim.sensor import QIS, BinarySPAD, CountingSPAD, Sensor, SpikeCamera
 from qsim.sensor.defects.defect_table import from_dict
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
-from qsim.streams.rows import Rows
 from qsim.streams.sensing import Sensing, replay, sense
 from qsim.streams.simulation import stored
 from qsim.streams.stream import Stream
@@ -45,7 +44,7 @@ def random_case(folder: Path, rng: np.random.Generator) -> Drawn:
     if rng.random() < 0.5:
         order = str(rng.choice(["up", "down", "left", "right"]))
         longest = (1 if how.get("group") else planes) / RATE / (height, width)[order in ("left", "right")]
-        how["rows"] = Rows(longest * rng.uniform(0.01, 1.05), order)
+        how |= {"row_delay": longest * rng.uniform(0.01, 1.05), "row_order": order}
     if rng.random() < 0.4:
         how["exposures"] = tuple(rng.choice([1.0, 0.5, 0.3, 1 / 16], int(rng.integers(1, 4))).tolist())
     if colour == (rng.random() < 0.95):
@@ -104,9 +103,9 @@ def departure(clip: Clip, stream: Stream, how: dict[str, Any]) -> float:
         passed = np.array(tile)[y % len(tile), x % len(tile[0])] / sensor.efficiency  # [H, W, 3]
         light = np.einsum("tbhw,hwb->thw", light, passed)
     late = np.zeros((height, width))
-    if "rows" in how:
-        line = {"down": y, "up": height - 1 - y, "right": x, "left": width - 1 - x}[how["rows"].order]
-        late = line * how["rows"].delay * RATE
+    if "row_delay" in how:
+        line = {"down": y, "up": height - 1 - y, "right": x, "left": width - 1 - x}[how["row_order"]]
+        late = line * how["row_delay"] * RATE
     shares = how.get("exposures", (1.0,))
     residuals = []
     variances = []

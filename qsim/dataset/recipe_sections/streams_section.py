@@ -6,7 +6,7 @@ from typing import Any
 
 from qsim import checks
 from qsim.dataset.recipe_sections.toml_section import Section, file_name
-from qsim.streams.rows import Rows
+from qsim.settings import settings_of
 from qsim.streams.sensing import Sensing
 from qsim.structure import Table
 
@@ -39,30 +39,15 @@ def streams_of(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     sensor = _sensor(
         section, given["sensor"], bits, given.get("group", False), given.get("slices", 1), given.get("temperature")
     )
-    with section.naming("row_order"):
-        rows = Rows.of(given.get("row_delay"), given.get("row_order"))
     if name is not None and (count := len(bits) * len(levels)) > 1:
         cure = "give one bits and one light level, or leave the name out"
         raise ValueError(f"{section.where('name')}: one name for {count} streams; {cure}")
-    found = [
-        Sensing(
-            sensor,
-            bits=b,
-            name=name,
-            colour=_colour(section, given.get("colour")),
-            seed=given.get("seed", seed),
-            group=given.get("group", False),
-            diffraction=given.get("diffraction", False),
-            slices=given.get("slices", 1),
-            follow=given.get("follow", False),
-            rows=rows,
-            exposures=given.get("exposures"),
-            temperature=given.get("temperature"),
-            **light,
-        )
-        for b in bits
-        for light in levels
-    ]
+    given["sensor"] = sensor
+    given["colour"] = _colour(section, given.get("colour"))
+    given.setdefault("seed", seed)
+    own = {setting.name: given[setting.name] for setting in settings_of(Sensing) if setting.name in given}
+    with section.naming():
+        found = [Sensing(**own | {"bits": b, "ppp": None, "lux": None} | light) for b in bits for light in levels]
     for sensing in found:
         with section.naming("sensor", "streams are named after the sensor: "):
             stream = sensing.stream_name

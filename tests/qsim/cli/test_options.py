@@ -199,11 +199,11 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ],
     ("sense", "--row-order"): [
         Acts("sense clip --ppp 3 --name n --row-delay 1e-6", "--row-order left"),
-        Refused("sense clip", "--row-order up", "row delay"),
+        Refused("sense clip", "--row-order up", "give row_delay"),
     ],
     ("sense", "--exposures"): [
         Acts("sense clip --ppp 3 --name n", "--exposures 1,0.25"),
-        Refused("sense clip", "--exposures 1,2", "share of a full exposure"),
+        Refused("sense clip", "--exposures 1,2", "exposures: expected"),
     ],
     ("sense", "--follow"): [
         Acts("sense clip --sensor counter.toml --ppp 3 --name n", "--follow"),
@@ -216,7 +216,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("sense", "--replay"): [
         Acts("sense clip --ppp 3.25 --bits 3", "--replay clip:1", stdout, before="sense clip --ppp 3.25 --bits 3"),
         Refused("sense clip --replay clip:1", "--ppp 3.25,26", "2 light levels"),
-        Refused("sense clip --replay clip:1", "--row-order up", "row delay"),
+        Refused("sense clip --replay clip:1", "--row-order up", "give row_delay"),
         *(
             Refused("sense clip --replay clip:1", option, option.split()[0])
             for option in (

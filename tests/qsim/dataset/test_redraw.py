@@ -18,7 +18,6 @@ from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe import Recipe
 from qsim.sensor.qis import QIS
 from qsim.streams.clip import Clip
-from qsim.streams.rows import Rows
 from qsim.streams.sensing import Sensing, prepare, sense, write_stream
 from qsim.streams.stream import Stream, write_packed
 
@@ -54,8 +53,16 @@ KINDS = {
     "spikes": (SPIKES.format(subtracts="true"), {"ppp": 9.0}, "spikes"),
     "spikes, reset to zero": (SPIKES.format(subtracts="false"), {"ppp": 9.0, "seed": 3}, "spikes"),
     "counting, slices": (COUNTING.format(bits=3), {"ppp": 3.0, "slices": 3}, "events"),
-    "counting, rows": (COUNTING.format(bits=3), {"ppp": 3.0, "slices": 2, "rows": Rows(9e-5, "up")}, "events"),
-    "planes, columns": (BINARY.format(bits=1) + DISTURBED, {"ppp": 0.7, "rows": Rows(3e-5, "left")}, "planes"),
+    "counting, rows": (
+        COUNTING.format(bits=3),
+        {"ppp": 3.0, "slices": 2, "row_delay": 9e-5, "row_order": "up"},
+        "events",
+    ),
+    "planes, columns": (
+        BINARY.format(bits=1) + DISTURBED,
+        {"ppp": 0.7, "row_delay": 3e-5, "row_order": "left"},
+        "planes",
+    ),
 }
 
 

@@ -150,11 +150,11 @@ def test_rates_in_the_file_are_used_and_none_may_contradict(tmp_path, capsys):
 
 def test_rows_at_their_own_time_are_stated(tmp_path):
     """In the file, and in the description of the codes that are read from it."""
-    rows = Rows(5e-5, "up")
+    rows = {"row_delay": 5e-5, "row_order": "up"}
     photon_times.write(
-        followed(moving(tmp_path / "c"), CountingSPAD(0.5, 10.0, 1e-6, 4), 5.0, rows=rows), tmp_path / "p.npz"
+        followed(moving(tmp_path / "c"), CountingSPAD(0.5, 10.0, 1e-6, 4), 5.0, **rows), tmp_path / "p.npz"
     )
-    assert photon_times.read(tmp_path / "p.npz").rows == rows
+    assert photon_times.read(tmp_path / "p.npz").rows == Rows(5e-5, "up")
     assert main(["convert", str(tmp_path / "p.npz"), str(tmp_path / "clocked")]) == 0
     assert Stream.open(tmp_path / "clocked.json").meta["source"]["rows"] == {"delay": 5e-5, "order": "up"}
 

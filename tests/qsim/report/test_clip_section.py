@@ -15,7 +15,6 @@ from qsim.optics.radiometry import RGB
 from qsim.report import clip_section, report
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
-from qsim.streams.rows import Rows
 from qsim.streams.sensing import Sensing, sense
 
 DEVICES = {
@@ -65,7 +64,7 @@ def test_no_expectation_is_shown_without_an_exact_one(tmp_path):
         assert f"defects: {cause} 0.05" in clip_section.stream_line(stream)
     grouped, _ = sense(clip, Sensing("spad-320x240", bits=2, ppp=2.0, name="grouped", group=True))
     assert "sums planes" in str(clip_section.unexpected(clip, grouped))
-    rolling, _ = sense(clip, Sensing("quiver-physical", ppp=2.0, name="rolling", rows=Rows(2e-6)))
+    rolling, _ = sense(clip, Sensing("quiver-physical", ppp=2.0, name="rolling", row_delay=2e-6))
     assert "its own part of two frames" in str(clip_section.unexpected(clip, rolling))
     assert "; each row 2e-06 s later, down" in clip_section.stream_line(rolling)
     bracketed, _ = sense(clip, Sensing("quiver-physical", ppp=2.0, name="bracketed", exposures=(1.0, 0.5)))

@@ -10,7 +10,6 @@ from qsim.report.views import Source, open_source
 from qsim.sensor import packing
 from qsim.sensor.qis import QIS
 from qsim.streams.photons import clip_photons
-from qsim.streams.rows import Rows
 from qsim.streams.stream import Stream, write_packed
 
 
@@ -84,7 +83,7 @@ def test_codes_of_several_clip_frames_stand_beside_the_light_of_their_exposure(t
 def test_codes_of_rows_at_their_own_time_stand_beside_the_middle_of_the_readout(tmp_path):
     """Eight rows of 7/8 of a clip frame each: the middle of the readout is 3.06 frames late."""
     clip = write_clip(tmp_path / "c", frames=28, height=8, width=11)
-    stream = clip.sense(QIS(0.8, 1.6, 0.2, 3), ppp=3.0, slices=7, rows=Rows(7 / 8 / clip.frame_rate))
+    stream = clip.sense(QIS(0.8, 1.6, 0.2, 3), ppp=3.0, slices=7, row_delay=7 / 8 / clip.frame_rate)
     source = open_source(clip.path)
     shown = slow_codes(source, stream)
     assert (len(stream), len(shown)) == (3, 24)

@@ -17,7 +17,6 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
-from qsim.streams.rows import Rows
 from qsim.streams.sensing import Sensing, assemble, prepare, replay, sense
 from qsim.streams.simulation import stored
 
@@ -110,9 +109,9 @@ def test_light_behind_a_filter_is_that_of_its_band(place):
 def test_rows_at_their_own_time_keep_their_filters(place):
     """A code is that of a clip in which every row was taken at its time: light first, then filters."""
     clip = colour_clip(place / "c", frames=6, shutter=1.0)
-    late = Rows(0.5 / 2000 / 7)
-    stream = clip.sense("mine.toml", ppp=4.0, rows=late)
-    light = prepare(clip, Sensing("mine.toml", ppp=4.0, rows=late)).light(clip, 0, 2)
+    late = 0.5 / 2000 / 7  # s
+    stream = clip.sense("mine.toml", ppp=4.0, row_delay=late)
+    light = prepare(clip, Sensing("mine.toml", ppp=4.0, row_delay=late)).light(clip, 0, 2)
     for t, y in np.ndindex(2, 7):
         share = y * 0.5 / 7
         photons = [clip_photons(clip, t + ahead, stream.photons_factor)[:, y : y + 1] for ahead in (0, 1)]

@@ -15,7 +15,6 @@ from qsim.sensor.defects.fixed_pattern import FixedPattern
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.streams import gates
-from qsim.streams.rows import Rows
 from qsim.streams.sensing import Sensing, prepare, replay, sense
 from qsim.studies.readouts import compare
 
@@ -26,7 +25,7 @@ SENSORS = {
     "plane": (BinarySPAD(0.5, 900.0, bits=1), {}),
     "sum of the clip's planes": (BinarySPAD(0.5, 900.0, bits=2), {"group": True, "bits": 2}),
     "counting": (CountingSPAD(pde=0.5, dark_count_rate=900.0, dead_time=4e-5, bits=5), {}),
-    "rows": (QIS(0.8, 800.0, 0.2, 3), {"rows": Rows(2e-5, "left")}),
+    "rows": (QIS(0.8, 800.0, 0.2, 3), {"row_delay": 2e-5, "row_order": "left"}),
     "defects": (QIS(0.8, 800.0, 0.2, 3), {"defects": Defects(FixedPattern(prnu=0.1, dead=0.05))}),
 }
 
@@ -106,17 +105,16 @@ def test_the_truth_of_light_beyond_white_is_not_cut_off(tmp_path):
 @pytest.mark.parametrize(
     ("shares", "message"),
     [
-        ((1.0, 0.0), "exposures: expected a share of a full exposure, above 0 .* to 1, got 0.0"),
-        ((-0.5,), "exposures: expected a share of a full exposure"),
-        ((1.0, 1.5), "exposures: expected a share of a full exposure, above 0 .* to 1, got 1.5"),
-        ((float("nan"),), "exposures: expected a share"),
-        ((), "exposures: expected 1 to 256 shares of a full exposure, got 0"),
+        ((1.0, 0.0), r"a number from 1e-06 to 1, got \(1\.0, 0\.0\)"),
+        ((-0.5,), r"got \(-0\.5,\)"),
+        ((1.0, 1.5), r"got \(1\.0, 1\.5\)"),
+        ((float("nan"),), r"got \(nan,\)"),
+        ((), r"got \(\)"),
     ],
 )
-def test_impossible_schedules_are_refused(tmp_path, shares, message):
-    clip = write_clip(tmp_path / "clip", frames=3, height=4, width=5)
-    with pytest.raises(ValueError, match=message):
-        prepare(clip, Sensing(QIS(0.8, 1.6, 0.2, 3), exposures=shares))
+def test_impossible_schedules_are_refused(shares, message):
+    with pytest.raises(ValueError, match=f"exposures: expected a list of 1 to 256: .*{message}"):
+        Sensing(QIS(0.8, 1.6, 0.2, 3), exposures=shares)
 
 
 def test_pixels_that_remember_are_refused(tmp_path):
@@ -128,7 +126,7 @@ def test_pixels_that_remember_are_refused(tmp_path):
         prepare(clip, Sensing(SENSORS["counting"][0], exposures=SCHEDULE, slices=2))
 
 
-@pytest.mark.parametrize("how", [{"exposures": SCHEDULE}, {"rows": Rows(2e-5)}])
+@pytest.mark.parametrize("how", [{"exposures": SCHEDULE}, {"row_delay": 2e-5}])
 def test_what_takes_equal_exposures_read_at_once_refuses_others(tmp_path, how):
     clip = write_clip(tmp_path / "clip", frames=6, height=4, width=5)
     for name in ("red", "green", "blue"):

@@ -20,7 +20,7 @@ def test_own_sensors_leave_no_stream(tmp_path: Path):
     clip = write_clip(tmp_path / "clip", frames=2, height=6, width=8)
     with pytest.raises(ValueError, match="Own: is none of the models that a file can name"):
         clip.sense(Own(0.8, 1.6, 0.2, 3), ppp=3.0)
-    with pytest.raises(ValueError, match=r"sensor is a sensor record, a name or a \.toml file, got 3"):
+    with pytest.raises(ValueError, match="sensor: expected a text or a Sensor, got 3"):
         clip.sense(3, ppp=3.0)
     assert clip.streams == ()
 

@@ -55,7 +55,7 @@ def test_every_pixel_sees_its_own_interval_of_the_light(tmp_path, order, kind):
         period = how.get("slices", 1)
         count = (height, width)[order in ("right", "left")]
         delay = period / RATE / count * (1.0 if n == 0 else 1 - 0.999 * rng.random())
-        draw = prepare(clip, Sensing(sensor, rows=Rows(delay, order), **how))
+        draw = prepare(clip, Sensing(sensor, row_delay=delay, row_order=order, **how))
         light = np.stack([draw.incident(clip, t) for t in range(14)])
         starts = lines(order, height, width) * delay * RATE
         assert draw.count(clip) == (14 - int(np.ceil(starts.max() - 1e-9))) // planes
@@ -76,7 +76,7 @@ def test_a_moving_edge_leans_by_speed_times_delay(tmp_path, order):
     stack = covered[:, None, :] if order in ("down", "up") else covered[:, :, None]
     clip = write_clip(tmp_path / "edge", radiance=np.ascontiguousarray(np.broadcast_to(stack, shape)), relative=True)
     delay = 1 / RATE / 32
-    draw = prepare(clip, Sensing(QIS(0.8, 1.6, 0.2, 3), ppp=1.0, rows=Rows(delay, order)))
+    draw = prepare(clip, Sensing(QIS(0.8, 1.6, 0.2, 3), ppp=1.0, row_delay=delay, row_order=order))
     light = draw.light(clip, 5, 6)[0] / draw.level.factor
     found = light.sum(axis=1 if order in ("down", "up") else 0)
     number = lines(order, height, width)[:, 0] if order in ("down", "up") else lines(order, height, width)[0]
@@ -89,14 +89,14 @@ def test_interpolated_rows_approach_rows_rendered_at_their_instants(tmp_path):
     width = 40
     fine = 32
     exact = sliding_pattern(4 * fine, height, width, 3, speed=3.0 / fine)
-    rows = Rows(1 / RATE / 10)
+    delay = 1 / RATE / 10
     errors = []
     for n in (1, 2, 4, 8):
         light = exact.reshape(4 * n, fine // n, height, width).mean(axis=1)  # an open shutter at n times the rate
         name = tmp_path / f"{n}"
         clip = write_clip(name, radiance=light, relative=True, frame_rate=n * RATE, exposure=1 / n / RATE)
         how = {"slices": n} if n > 1 else {}
-        draw = prepare(clip, Sensing(COUNTER, ppp=1.0, rows=rows, **how))
+        draw = prepare(clip, Sensing(COUNTER, ppp=1.0, row_delay=delay, **how))
         found = draw.light(clip, n, 2 * n).sum(axis=0) / n / draw.level.factor
         starts = fine + np.arange(height)[:, None] * 0.1 * fine + np.zeros(width)
         errors.append(float(np.sqrt(np.mean((found - interval(exact, starts, fine) / fine) ** 2))))
@@ -109,27 +109,27 @@ def test_streams_keep_their_readout(tmp_path, kind):
     """Stored, replayed and drawn again by the description alone; a stream of other rows is not taken for it."""
     sensor, how = SENSORS[kind]
     clip = write_clip(tmp_path / "clip", frames=13, height=7, width=9)
-    rows = Rows(3e-5, "up")
-    stream, line = sense(clip, Sensing(sensor, ppp=4.0, name="s", rows=rows, **how))
+    rows = {"row_delay": 3e-5, "row_order": "up"}
+    stream, line = sense(clip, Sensing(sensor, ppp=4.0, name="s", **rows, **how))
     assert "each row 3e-05 s later, up" in line
-    assert stream.rows == rows
+    assert stream.rows == Rows(3e-5, "up")
     frames = len(stream)
     for t in range(frames):
         drawn, kept = replay(clip, stream, t)
         np.testing.assert_array_equal(drawn, kept)
     (found,) = redraw(stream.path)
     assert (found.differ, found.why) == (0, None)
-    assert sense(clip, Sensing(sensor, ppp=4.0, name="s", rows=rows, **how))[0].meta == stream.meta
-    for other in (None, Rows(3e-5, "down")):
+    assert sense(clip, Sensing(sensor, ppp=4.0, name="s", **rows, **how))[0].meta == stream.meta
+    for other in ({}, {"row_delay": 3e-5}):
         with pytest.raises(FileExistsError, match="exists with other settings"):
-            sense(clip, Sensing(sensor, ppp=4.0, name="s", rows=other, **how))
+            sense(clip, Sensing(sensor, ppp=4.0, name="s", **other, **how))
 
 
 def test_the_truth_is_that_of_each_row_or_of_the_middle_of_the_frame(tmp_path):
     """Four slices per code: the row read n-th is exposed around frame 4 t + n / 2 + 3 / 2."""
     frames = np.broadcast_to(np.arange(1.0, 21)[:, None, None], (20, 8, 5))
     clip = write_clip(tmp_path / "clip", radiance=np.ascontiguousarray(frames), relative=True)
-    how = Sensing(COUNTER, ppp=1.0, slices=4, rows=Rows(0.5 / RATE, "up"))
+    how = Sensing(COUNTER, ppp=1.0, slices=4, row_delay=0.5 / RATE, row_order="up")
     stream, _ = sense(clip, how)
     assert stream.shape == (4, 8, 5)
     number = lines("up", 8, 5)
@@ -145,31 +145,35 @@ def test_the_truth_is_that_of_each_row_or_of_the_middle_of_the_frame(tmp_path):
 def test_readouts_that_cannot_be_are_refused(tmp_path):
     clip = write_clip(tmp_path / "clip", frames=5, height=10, width=7)
     sensor = QIS(0.8, 1.6, 0.2, 3)
-    for rows, what in ((Rows(5.1e-5), "10 rows of 5.1e-05 s"), (Rows(7.2e-5, "left"), "7 columns of 7.2e-05 s")):
+    for delay, order, what in ((5.1e-5, "down", "10 rows of 5.1e-05 s"), (7.2e-5, "left", "7 columns of 7.2e-05 s")):
         with pytest.raises(ValueError, match=f"{what} take .* longer than a frame or plane of 0.0005 s; the largest"):
-            prepare(clip, Sensing(sensor, rows=rows))
-    prepare(clip, Sensing(sensor, rows=Rows(5e-5)))
+            prepare(clip, Sensing(sensor, row_delay=delay, row_order=order))
+    prepare(clip, Sensing(sensor, row_delay=5e-5))
     with pytest.raises(ValueError, match=r"10 rows .* of 0.0005 s"):  # a plane, not the sum of three
-        prepare(clip, Sensing(BinarySPAD(0.5, 100.0, bits=2), bits=2, group=True, rows=Rows(6e-5)))
+        prepare(clip, Sensing(BinarySPAD(0.5, 100.0, bits=2), bits=2, group=True, row_delay=6e-5))
     with pytest.raises(ValueError, match="5 frames are too few for one code, whose last row needs 6"):
-        prepare(clip, Sensing(COUNTER, slices=5, rows=Rows(1e-5)))
+        prepare(clip, Sensing(COUNTER, slices=5, row_delay=1e-5))
     half = write_clip(tmp_path / "half", frames=5, height=10, width=7, exposure=2.5e-4)
     with pytest.raises(ValueError, match="rows at their own time need a clip whose shutter is open all the time"):
-        prepare(half, Sensing(sensor, rows=Rows(1e-5)))
-    for make, message in (
-        (lambda: Rows(0.0), "row delay: expected a number above 0, got 0.0"),
-        (lambda: Rows(-1e-6), "row delay: expected a number above 0"),
-        (lambda: Rows(float("nan")), "row delay: "),
-        (lambda: Rows(1e-6, "sideways"), "row order: expected the order in which rows are read, down, up, right, left"),
+        prepare(half, Sensing(sensor, row_delay=1e-5))
+    for how, message in (
+        ({"row_delay": 0.0}, "row_delay: expected a number above 0, got 0.0"),
+        ({"row_delay": -1e-6}, "row_delay: expected a number above 0"),
+        ({"row_delay": float("nan")}, "row_delay: "),
+        (
+            {"row_delay": 1e-6, "row_order": "sideways"},
+            "row_order: expected one of down, up, right, left, got 'sideways",
+        ),
+        ({"row_order": "up"}, "row_order up: orders rows that have their own time; give row_delay too"),
     ):
         with pytest.raises(ValueError, match=message):
-            make()
+            Sensing(sensor, **how)
 
 
 def test_rows_read_no_frame_beyond_their_reach(tmp_path):
     """Delays that are whole but for rounding, as 100 x 0.55 = 55 + 7e-15, and random ones."""
     clip = write_clip(tmp_path / "clip", frames=111, height=101, width=2)
-    draw = prepare(clip, Sensing(COUNTER, ppp=1.0, slices=56, rows=Rows(2.75e-4)))
+    draw = prepare(clip, Sensing(COUNTER, ppp=1.0, slices=56, row_delay=2.75e-4))
     assert draw.count(clip) == 1
     assert draw.frames(clip, 0, 1).shape == (1, 101, 2)
     rng = np.random.default_rng(0)

@@ -153,13 +153,21 @@ def test_two_light_levels_share_their_random_numbers_and_another_seed_does_not(t
     assert abs(np.corrcoef(low, other)[0, 1]) < 5 / np.sqrt(light.size)
 
 
-@pytest.mark.parametrize("seed", [-1, 2**64])
-def test_a_seed_that_no_description_can_hold_is_refused(tmp_path: Path, seed: int):
-    clip = write_clip(tmp_path / "c", frames=2)
-    with pytest.raises(ValueError, match=f"c: the seed must be a whole number from 0 to 2\\^64 - 1, got {seed}"):
-        sense(clip, Sensing("quiver-physical", 3, 3.25, seed=seed, name="s"))
-    assert not list(clip.path.glob("streams/*"))
-    assert sense(clip, Sensing("quiver-physical", 3, 3.25, seed=2**64 - 1, name="s"))[0].meta["seed"] == 2**64 - 1
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"seed": -1}, "seed: expected a whole number from 0 to 2147483647, got -1"),
+        ({"seed": 2**31}, "seed: expected a whole number from 0 to 2147483647, got 2147483648"),
+        ({"bits": 17}, "bits: expected a whole number from 1 to 16, got 17"),
+        ({"slices": 0}, "slices: expected a whole number from 1 to 100000, got 0"),
+        ({"ppp": 0.0}, "ppp: expected a number from 1e-06 to 1e\\+06, got 0.0"),
+        ({"ppp": 3.25, "lux": 1.0}, "give the light level as ppp or as lux, not both"),
+        ({"group": True, "slices": 2}, "group sums planes, slices are of one exposure; give one of them"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused_before_a_clip_is_read(settings: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        Sensing("quiver-physical", **settings)
 
 
 @pytest.mark.parametrize(

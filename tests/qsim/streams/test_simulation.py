@@ -19,7 +19,6 @@ from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
-from qsim.streams.rows import Rows
 from qsim.streams.sensing import Sensing, describe, prepare, replay, sense, write_stream
 from qsim.streams.simulation import stored
 
@@ -82,7 +81,7 @@ def test_codes_whose_truth_has_other_light_say_so(tmp_path, bits, stated):
 
 @pytest.mark.parametrize(
     ("how", "stated"),
-    [({"slices": 2}, True), ({"slices": 3}, False), ({"slices": 1}, False), ({"slices": 2, "rows": Rows(1e-5)}, False)],
+    [({"slices": 2}, True), ({"slices": 3}, False), ({"slices": 1}, False), ({"slices": 2, "row_delay": 1e-5}, False)],
 )
 def test_a_truth_that_is_late_is_stated(tmp_path, how, stated):
     """Two slices have no middle frame; rows at their own time take the frame nearest to each."""
