@@ -17,7 +17,7 @@ from qsim.calibration.frame_statistics import FrameStatistics
 from qsim.calibration.results import Value, normal_interval
 from qsim.calibration.spad_response import NEIGHBOURS, Response
 
-_LARGEST = 0.5  # of either probability
+LARGEST = 0.5  # of either probability
 _LEAST = 1e-6
 
 
@@ -90,7 +90,7 @@ def _combined(pairs: Sequence[_Pairs | None]) -> Chance:
     for _ in range(10):  # the variances depend on the value
         events = max(value, 0.0) * expected / unit + 1
         variances = (noise + events * unit**2) / expected**2
-        value = float(np.clip(np.average(covariance / expected, weights=1 / variances), -_LARGEST, _LARGEST))
+        value = float(np.clip(np.average(covariance / expected, weights=1 / variances), -LARGEST, LARGEST))
     return Chance(value, 1 / float((1 / variances).sum()))
 
 

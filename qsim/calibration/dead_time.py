@@ -112,7 +112,8 @@ def _polished(ratio: float, residuals: Callable[[float], Array], bounds: tuple[f
     """
     for _ in range(4):
         step = max(1e-3 * ratio, 1e-6)
-        slope = (residuals(ratio + step) - residuals(ratio - step)) / (2 * step)
+        below = max(ratio - step, 0.0)  # a dead time is not negative
+        slope = (residuals(ratio + step) - residuals(below)) / (ratio + step - below)
         change = float(slope @ residuals(ratio)) / max(float(slope @ slope), 1e-300)
         ratio = float(np.clip(ratio - change, *bounds))
     return ratio

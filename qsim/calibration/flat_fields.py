@@ -42,7 +42,7 @@ def dark_rates(darks: Sequence[FrameStatistics], response: Response) -> DarkRate
     weight = np.zeros(shape)
     rate = np.zeros(shape)
     variance = np.zeros(shape)
-    missing = np.full(shape, -1.0)
+    missing = np.full(shape, -np.inf)  # below 0 where a fitted dead time allows fewer counts than there were
     frames = np.zeros(shape)
     exposure = np.zeros(shape)
     for stack in sorted(darks, key=lambda one: one.exposure):

@@ -19,7 +19,7 @@ from math import inf, isfinite, log, nan, sqrt
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.calibration.correlations import Correlations, measure_correlations
+from qsim.calibration.correlations import LARGEST, Correlations, measure_correlations
 from qsim.calibration.dark_distribution import Counts, Distribution, distribution
 from qsim.calibration.dead_time import Pooled, Ratio, fitted_dead_time, matched_variance, moved_ratio
 from qsim.calibration.flat_fields import DarkRates, dark_rates, light_of, most_counts, spad_flats, too_bright
@@ -195,9 +195,9 @@ class _Array:
         cross = self.correlations.crosstalk
         found = []
         if after.variance is not None:
-            found.append(replace(self.response, afterpulsing=after.value + Z95 * after.sigma))
+            found.append(replace(self.response, afterpulsing=min(after.value + Z95 * after.sigma, LARGEST)))
         if cross.variance is not None:
-            found.append(replace(self.response, crosstalk=cross.value + Z95 * cross.sigma))
+            found.append(replace(self.response, crosstalk=min(cross.value + Z95 * cross.sigma, LARGEST)))
         if self.ratio is None:
             return found
         pooled = self._pooled()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from stats import assert_share
 
-from qsim.calibration.dead_time import calibrate_static, matched_variance
+from qsim.calibration.dead_time import Pooled, calibrate_static, fitted_dead_time, matched_variance
 from qsim.calibration.results import Calibration
 from qsim.calibration.spad_response import Response
 from qsim.keys import Key
@@ -93,3 +93,15 @@ def test_a_value_that_is_not_a_code_names_its_place(value, words):
     counts[3, 2, 30] = value
     with pytest.raises(ValueError, match=rf"a.npy: {words}.* at \(t, y, x\) = \(3, 2, 30\) is not a code of 8 bits"):
         calibrate_static(counts, bits=8, exposure=1e-5, name="a.npy")
+
+
+@pytest.mark.parametrize("excess", [1e-9, 1e-7, 1e-6, 1e-4])
+def test_a_dead_time_near_none_is_placed_without_leaving_its_range(excess):
+    """Flats whose variance is hardly below that of Poisson counts."""
+    response = Response(5, 0.0, False, 1e-6)
+    flats = [Pooled(mean, mean * (1 - 2 * excess * mean), 0.0, 400, 200, 1e-6) for mean in (2.0, 6.0)]
+    found = fitted_dead_time(flats, response)
+    assert found is not None
+    assert 0.0 <= found.value <= 20 * excess + 1e-5
+    assert found.low == 0.0
+    assert found.high > found.value
