@@ -1,22 +1,18 @@
-"""Times the restorer that ships beside QBP + BM3D of an older commit, in turn and in one run.
+"""Times the restorer that ships beside QBP + BM3D, in turn and in one run.
 
     python benchmarks/restorer_cost.py                 # docs/results/restorer_cost.md; about six minutes of quiet cores
 
 Both restore eleven frames of 512 x 1024: a photograph that slides by 2 px/frame, 3 bits, 3.25 PPP, with the threads
 of their defaults. Each program is a separate process that stays, their runs alternate, and the first ones are not
-counted. The older program comes from the history of this repository, so that a faster QBP of today moves nothing.
-Last, `quiver restore` restores such frames from a file: the most memory of its complete process.
+counted. Last, `quiver restore` restores such frames from a file: the most memory of its complete process.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
-import os
 import re
 import subprocess
 import sys
-import tarfile
 import tempfile
 from pathlib import Path
 from statistics import median
@@ -31,9 +27,7 @@ from qsim.sensor.devices import quiver_physical
 from qsim.tables import markdown_table
 
 ROOT = Path(__file__).parents[1]
-OLD = "5c22140"
 FRAMES = 11
-MEMORY = ROOT / "qsim" / "process.py"  # of this commit, for the older program too
 COMMAND = """
 import sys
 from qsim.process import peak_memory
@@ -44,14 +38,18 @@ sys.exit(code)
 """
 
 LIGHT = """
-import runpy, sys, time
+import sys
+import time
 import numpy as np
 from skimage import data
-height, width, frames = (int(word) for word in sys.argv[2:])
+height, width, frames = (int(word) for word in sys.argv[1:])
 picture = np.hstack([data.camera().astype(float)] * 2)[:height, :width]
 photons = np.stack([np.roll(picture, 2 * t, axis=1) for t in range(frames)]) * (3.25 / picture.mean())
 from qsim.keys import Key
-peak_memory = runpy.run_path(sys.argv[1])["peak_memory"]
+from qsim.process import peak_memory
+from qsim.sensor.devices import quiver_physical
+sensor = quiver_physical(3.25)
+codes = sensor.sample(photons, 5e-4, key=Key(0, 0))
 """
 LOOP = """
 for _ in sys.stdin:
@@ -60,42 +58,26 @@ for _ in sys.stdin:
     print(time.perf_counter() - started, peak_memory(), flush=True)
 """
 QBP = """
-from qsim.devices import quiver_physical
 from quiver.baselines import METHODS
-sensor = quiver_physical(3.25)
-codes = sensor.sample(photons, 5e-4, key=Key(0, 0))
 def once():
     METHODS["qbp-bm3d"].restore(codes, sensor, 5e-4)
 """
 MERGENET = """
-from qsim.sensor.devices import quiver_physical
 from quiver.data.codes import array_codes
 from quiver.restoration.restorers import restorer
-sensor = quiver_physical(3.25)
-codes = array_codes(sensor.sample(photons, 5e-4, key=Key(0, 0)), sensor, 5e-4)
+known = array_codes(codes, sensor, 5e-4)
 method = restorer("mergenet")
 def once():
-    method.restore(codes)
+    method.restore(known)
 """
-
-
-def unpack(commit: str, folder: Path) -> None:
-    """Write the files of a commit. `ValueError` if this is no clone that holds it."""
-    done = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True, check=False)
-    if done.returncode:
-        raise ValueError(f"commit {commit} is not here; run this in a clone with the complete history")
-    with tarfile.open(fileobj=io.BytesIO(done.stdout)) as archive:
-        archive.extractall(folder, filter="data")
 
 
 class Program:
     """One program that runs once for every line on its input."""
 
-    def __init__(self, text: str, folder: Path, size: tuple[int, int], frames: int) -> None:
-        words = [sys.executable, "-W", "ignore", "-c", LIGHT + text + LOOP, *map(str, (MEMORY, *size, frames))]
-        self.process = subprocess.Popen(
-            words, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment(folder)
-        )
+    def __init__(self, text: str, size: tuple[int, int], frames: int) -> None:
+        words = [sys.executable, "-W", "ignore", "-c", LIGHT + text + LOOP, *map(str, (*size, frames))]
+        self.process = subprocess.Popen(words, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def run(self) -> tuple[float, float]:
         """Return the seconds of one run, and the most memory so far [bytes]."""
@@ -113,11 +95,6 @@ class Program:
         self.process.communicate()
 
 
-def environment(folder: Path) -> dict[str, str]:
-    """Return the environment of a program whose modules lie in a folder."""
-    return {**os.environ, "PYTHONPATH": str(folder)}
-
-
 def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=3, help="counted runs of each program (default 3)")
@@ -131,9 +108,7 @@ def main(words: list[str] | None = None) -> int:
             raise ValueError(f"--runs {args.runs}: give at least 1")
         if not args.busy:
             rows.wait_for_quiet()
-        with tempfile.TemporaryDirectory() as folder:
-            unpack(OLD, Path(folder))
-            found = measured(Path(folder), size, args.runs)
+        found = measured(size, args.runs)
         memory = command_memory(size)
     except ValueError as error:
         print(f"restorer_cost: {error}", file=sys.stderr)
@@ -153,12 +128,9 @@ def sides(text: str) -> tuple[int, int]:
     return found[0], found[1]
 
 
-def measured(old: Path, size: tuple[int, int], runs: int) -> dict[str, list[tuple[float, float]]]:
+def measured(size: tuple[int, int], runs: int) -> dict[str, list[tuple[float, float]]]:
     """Return seconds per frame and memory of the counted runs of both programs."""
-    programs = {
-        "QBP + BM3D, earlier program": Program(QBP, old, size, FRAMES),
-        "mergenet": Program(MERGENET, ROOT, size, FRAMES),
-    }
+    programs = {"QBP + BM3D": Program(QBP, size, FRAMES), "mergenet": Program(MERGENET, size, FRAMES)}
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in programs}
     for turn in range(runs + 1):
         for name, program in programs.items():
@@ -189,7 +161,7 @@ def command_memory(size: tuple[int, int]) -> int:
 
 def page(found: dict[str, list[tuple[float, float]]], memory: int, size: str, busy: bool) -> str:
     """Return the page of both programs, and of the memory of the command."""
-    old, own = (median(seconds for seconds, _ in runs) for runs in found.values())
+    classical, network = (median(seconds for seconds, _ in runs) for runs in found.values())
     table = [
         (
             name,
@@ -207,7 +179,7 @@ def page(found: dict[str, list[tuple[float, float]]], memory: int, size: str, bu
         "programs of the table also hold and draw the light.",
         "",
     ]
-    text += [f"Ratio of the medians: {old / own:.2f}. Machine: {rows.machine()}.", ""]
+    text += [f"Ratio of the medians: {classical / network:.2f}. Machine: {rows.machine()}.", ""]
     return "\n".join([*text, *(["Measured beside other programs.", ""] if busy else [])])
 
 
