@@ -17,6 +17,8 @@ from unittest import mock
 
 import drjit as dr
 
+from qsim import records
+
 REST = "rest"
 AFTER = ("truth", "writing")  # parts that are not radiance
 
@@ -99,12 +101,12 @@ def middle(taken: Sequence[Mapping[str, float]], names: Sequence[str]) -> dict[s
     return {"processor_seconds": round(median(radiance), 5), "parts": parts}
 
 
-def meta(scene: Any, describe: Callable[[Any], Any], frames: int, frame_rate: float) -> dict[str, Any]:
+def described(scene: Any, frames: int, frame_rate: float) -> dict[str, Any]:
     """Return what a writer of a clip needs to know of it."""
     return {
         "shape": [frames, scene.camera.height, scene.camera.width],
         "frame_rate": frame_rate,
         "exposure": 1 / frame_rate,
         "radiance_unit": "W m^-2 sr^-1",
-        "camera": describe(scene.camera),
+        "camera": records.plain(scene.camera),
     }

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 from clip_page import page
-from clip_parts import meta, timed_frames
+from clip_parts import described, timed_frames
 from cycles_rows import use_only
 from numpy import ndarray as Array
 from reuse_rows import FAMILIES, decibels
@@ -44,7 +44,7 @@ from qsim.colour import bright_end
 from qsim.rendering.budget import Budget
 from qsim.rendering.fidelity import DEEPEST, choose_budget
 from qsim.rendering.renderer import Renderer
-from qsim.scene import Scene, describe
+from qsim.scene import Scene
 from qsim.studies.validation.rendering import NaiveLoop
 
 TRIAL = 64  # samples per pixel of the naive loop
@@ -177,7 +177,7 @@ def ours_at(scene: Scene, plan: Plan, references: Array, reuse: bool) -> dict[st
         return way
     renderer = Renderer(scene, budget=budget, seed=plan.seed, frames=plan.frames)
     with tempfile.TemporaryDirectory() as folder:
-        told = meta(scene, describe, len(plan.rendered), renderer.frame_rate)
+        told = described(scene, len(plan.rendered), renderer.frame_rate)
         pictures, taken = timed_frames(renderer, ClipWriter(Path(folder) / "clip", told), plan.rendered, TARGETS)
     errors = reached(np.stack([pictures[t] for t in plan.judged]), references)
     return way | {"asked": plan.level, "reached": errors, "choosing_seconds": round(choosing, 2)} | taken

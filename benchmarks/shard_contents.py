@@ -25,15 +25,15 @@ FITTED = (1 / 64, 1 / 4)  # cycles/px between which the power law is fitted
 def contents(clip: Clip) -> dict[str, Any]:
     """Return the size, the budget and the stated PSNR of a clip, and its motion, contrast and spectrum."""
     clip.require_one_band("this page")
-    reached = stated(clip.meta)
-    budget = clip.meta.get("render", {})
+    reached = stated(clip.info)
+    budget = clip.info.render
     looked_at = np.unique(np.linspace(0, len(clip) - 1, LOOKED_AT).round().astype(int))
     images = np.stack([clip.radiance(int(t)) for t in looked_at])
     power = spectrum(images)
     return {
         "shape": list(clip.shape),
-        "samples": budget.get("samples"),
-        "neighbours": budget.get("neighbours"),
+        "samples": budget and budget.samples,
+        "neighbours": budget and budget.neighbours,
         "psnr": None if reached is None else reached.psnr,
         "motion": motion(clip.flow(t) for t in range(len(clip))),
         "contrast": contrast(images),

@@ -16,6 +16,7 @@ from qsim.lazy_imports import lazy_names
 if TYPE_CHECKING:
     from qsim.calibration.qis import calibrate_qis
     from qsim.calibration.spad import calibrate_spad
+    from qsim.clip.clip_info import ClipInfo
     from qsim.clip.writer import ClipWriter
     from qsim.dataset.dataset import Dataset
     from qsim.dataset.scene_rendering import render
@@ -46,6 +47,7 @@ _HOMES = {
     "Camera": "optics.camera",
     "Budget": "rendering.budget",
     "Clip": "streams.clip",
+    "ClipInfo": "clip.clip_info",
     "ClipWriter": "clip.writer",
     "CountingSPAD": "sensor.counting",
     "Dataset": "dataset.dataset",
@@ -77,6 +79,7 @@ __all__ = [
     "Budget",
     "Camera",
     "Clip",
+    "ClipInfo",
     "ClipWriter",
     "CountingSPAD",
     "Dataset",

@@ -13,6 +13,12 @@ LARGEST = 1e30  # of numbers in SI units: products of larger ones overflow
 SMALLEST = 1e-30  # of numbers above 0
 UNLIMITED = (1 << 40) - 1  # whole numbers that reach this are not bounded by what they mean
 
+
+def text_like(pattern: str, words: str) -> Meta:
+    """Describe texts that match a pattern as a whole; messages say `words`."""
+    return Meta(pattern=rf"^(?:{pattern})$(?!\n)", extra={"words": words})
+
+
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0.0, le=LARGEST)]
 Positive = Annotated[float, Meta(ge=SMALLEST, le=LARGEST)]
@@ -31,8 +37,8 @@ Seed = Annotated[int, Meta(ge=0, le=(1 << 31) - 1)]
 Planes = Annotated[int, Meta(ge=1, le=1 << 24)]  # binary planes in one value
 
 Text = Annotated[str, Meta(min_length=1)]
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,199}$")]  # of a file or folder
-Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]  # SHA-256
+Name = Annotated[str, text_like(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}", "a name of letters, digits, '.', '_' and '-'")]
+Digest = Annotated[str, text_like("[0-9a-f]{64}", "a SHA-256 of 64 hexadecimal digits")]
 Split = Literal["train", "val", "test"]
 RowOrder = Literal["down", "up", "right", "left"]  # rows from the top or the bottom, columns from the left or right
 Schedule = Annotated[tuple[Share, ...], Meta(min_length=1, max_length=256)]  # exposures of codes, in turn

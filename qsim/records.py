@@ -21,7 +21,7 @@ from qsim import kinds
 from qsim.checks import shown, suggest
 
 Made = TypeVar("Made")
-_PLACE = re.compile(r" - at `(?:key in )?\$(?P<path>[^`]*)`$")
+_PLACE = re.compile(r" - at (?P<key>`key` in )?`\$(?P<path>[^`]*)`$")
 _PART = re.compile(r"\.?(?P<name>[^.\[\]]+)|\[(?P<number>\d+|\.\.\.)\]")
 
 
@@ -39,20 +39,20 @@ def convert(found: Any, kind: type[Made], where: str, *, cure: str = "") -> Made
         raise ValueError(f"{where}: is nested too deeply{advice}") from None
 
 
-def plain(record: Any) -> Any:
-    """Return a record as the values that JSON and TOML hold; fields that hold their default are left out."""
+def plain(record: Any, *, complete: bool = False) -> Any:
+    """Return a record as the values that JSON and TOML hold; fields at their default are left out unless `complete`."""
     if dataclasses.is_dataclass(record) and not isinstance(record, type):
         given = {}
         for field in dataclasses.fields(record):
             value = getattr(record, field.name)
-            if not _is_default(field, value):
-                given[field.name] = plain(value)
+            if complete or not _is_default(field, value):
+                given[field.name] = plain(value, complete=complete)
         return given
     if isinstance(record, Mapping):
-        return {key: plain(value) for key, value in record.items()}
+        return {key: plain(value, complete=complete) for key, value in record.items()}
     if isinstance(record, list | tuple):
-        return [plain(item) for item in record]
-    return record
+        return [plain(item, complete=complete) for item in record]
+    return _of_python(record)
 
 
 def settle(record: Any) -> None:
@@ -93,6 +93,8 @@ def _words(hint: Any) -> str:
     """Return what one alternative of a type expects."""
     bare = _bare(hint)
     bounds = _bounds(hint)
+    if "words" in bounds:
+        return str(bounds["words"])
     origin = get_origin(bare)
     if origin is Literal:
         return "one of " + ", ".join(str(value) for value in get_args(bare))
@@ -153,7 +155,7 @@ def _bare(hint: Any) -> Any:
 
 
 def _bounds(hint: Any) -> dict[str, Any]:
-    """Return the bounds that the annotations of a type state: ge, gt, le, lt, min_length, max_length, pattern."""
+    """Return what the annotations of a type state: ge, gt, le, lt, min_length, max_length, pattern, and its words."""
     found: dict[str, Any] = {}
     while get_origin(hint) is Annotated:
         inner, *notes = get_args(hint)
@@ -163,6 +165,8 @@ def _bounds(hint: Any) -> dict[str, Any]:
                     value = getattr(meta, name)
                     if value is not None:
                         found.setdefault(name, value)
+                if meta.extra and "words" in meta.extra:
+                    found.setdefault("words", meta.extra["words"])
         hint = inner
     return found
 
@@ -197,6 +201,8 @@ def _told(problem: str, found: Any, kind: Any) -> str:
         return f"key '{path.lstrip('.') + '.' if path else ''}{missing[1]}' is missing"
     name = path.lstrip(".")
     before = f"{name}: " if name else ""
+    if match and match["key"]:
+        return f"{before}{_misfit_key(*_at(path, kind, found))}"
     if not re.match(r"(Expected|Invalid|Number|Integer|Object)\b", text):
         return f"{before}{text}"  # of the record's own rules
     hint, value = _at(path, kind, found)
@@ -230,6 +236,17 @@ def _first_misfit(hint: Any, values: Mapping[str, Any]) -> tuple[Any, Any]:
         except msgspec.ValidationError:
             return kind, value
     return hint, values
+
+
+def _misfit_key(hint: Any, values: Mapping[Any, Any]) -> str:
+    """Return what is expected of the keys of a dictionary, and the first that does not fit."""
+    (kind,) = (get_args(_bare(member))[0] for member in members_of(hint) if get_origin(_bare(member)) is dict)
+    for key in values:
+        try:
+            msgspec.convert(key, kind)
+        except msgspec.ValidationError:
+            return f"expected {words_of(kind)} as key, got {shown(key)}"
+    return f"expected {words_of(kind)} as key"
 
 
 def _item_hint(hint: Any, number: int) -> Any:

@@ -37,7 +37,7 @@ print(scene)
 
 clip = qsim.render(scene, frames=frames, height=width // 2, width=width, psnr=32)
 print(clip)
-print(f"error {clip.meta['psnr_of_truth']:.1f} dB below white")
+print(f"error {clip.info.psnr_of_truth:.1f} dB below white")
 
 # %%
 # Every clip has ground truth: depth, flow to the next frame, and the body that each pixel sees.

@@ -78,7 +78,7 @@ def _blocks(path: Path, bits: int, exposure: float, planes: int | None, hints: H
         hints = replace(hints, layout="codes" if hints.width is None else "cube")
     recording = importing.read(path, replace(hints, bits=min(bits, 16)), compared=("bits",))
     if recording.is_light or recording.bits != bits:
-        raise ValueError(f"{path}: holds {recording.source}, not values of {bits} bits")
+        raise ValueError(f"{path}: holds {recording.format}, not values of {bits} bits")
     return (block for _, block in importing.blocks(recording))
 
 
@@ -137,7 +137,7 @@ def read_counts(
     if not bare:
         recording = importing.read(path, replace(hints, bits=bits), compared=("bits",))
         if recording.is_light:
-            raise ValueError(f"{path}: holds {recording.source} of light, not counts")
+            raise ValueError(f"{path}: holds {recording.format} of light, not counts")
         return recording.read(0, recording.shape[0])
     array = load_array(path)
     array = array[None] if array.ndim == 2 else array

@@ -6,10 +6,11 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from qsim import checks, files
+from qsim import files, records
 from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, command, note, output, refuse_idle
 from qsim.cli.options import check_free, count, positive
 from qsim.cli.reader_options import LAYOUT, add_reader_options, hints_of
+from qsim.clip.source import Times
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
@@ -138,8 +139,7 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
         exporting.check(clip, wanted)
     with bar("converting", "clip") as progress:
         for n, clip in enumerate(clips, 1):
-            split = clip.meta.get("split")  # it becomes a folder, and the name a file
-            folder = args.output / ("all" if split is None else checks.split(split))
+            folder = args.output / (clip.info.split or "all")
             target = folder / f"{files.check_name(clip.name)}{suffix}"
             made.append(exporting.described(clip, target, wanted, force=args.force))
             progress(n, len(clips))
@@ -192,12 +192,12 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
                 args.after_interrupt = args.after_interrupt if pairs else RESUMES
                 clip = importing.to_clip(recording, target, capture, force=args.force, progress=progress)
                 made.append(
-                    (clip.path, f"{_size(clip)}, light of {recording.source}; {importing.saturation_line(clip)}")
+                    (clip.path, f"{_size(clip)}, light of {recording.format}; {importing.saturation_line(clip)}")
                 )
                 _tell_reading(source, recording)
                 continue
             stream = importing.to_stream(recording, target, capture, force=args.force, progress=progress)
-            made.append((stream.path, f"{_size(stream)}, {stream.bits}-bit codes, {recording.source}"))
+            made.append((stream.path, f"{_size(stream)}, {stream.bits}-bit codes, {recording.format}"))
             _tell_reading(source, recording)
     return made
 
@@ -226,13 +226,16 @@ def _restored(source: Path) -> dict[str, Any]:
 
 def _size(made: Clip | Stream) -> str:
     frames, height, width = made.shape
-    rate = float(made.meta["frame_rate"])
+    rate = made.frame_rate if isinstance(made, Clip) else float(made.meta["frame_rate"])
     exposure = made.exposure
     said = f"{frames} frames of {height} x {width} pixels at {rate:g} per second, exposure {exposure * 1e6:.4g} us"
-    times = made.meta.get("times")
+    if isinstance(made, Clip):
+        times = made.info.times
+    else:
+        times = records.convert(made.meta["times"], Times, "times") if "times" in made.meta else None
     if times is None:
         return said
-    return f"{said}, times {times['values'][0]:.10g} to {times['values'][-1]:.10g} {times['unit']} ({times['source']})"
+    return f"{said}, times {times.values[0]:.10g} to {times.values[-1]:.10g} {times.unit} ({times.source})"
 
 
 def _flat_name(file: Path, folder: Path) -> str:

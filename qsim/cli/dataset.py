@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from qsim import checks, files
+from qsim import checks
 from qsim.cli import documented_keys
 from qsim.cli.console import PILOT, RESUMES, bar, command, note, output
 from qsim.cli.options import checked, part_of
@@ -90,10 +90,11 @@ def _defaults(wanted: Recipe) -> str:
 def _noisy(folder: Path, jobs: list[Job]) -> list[str]:
     """Return a line for each finished clip whose error exceeds that of the recipe."""
     from qsim.clip.clamped_error import stated
+    from qsim.clip.manifest import read_info
     from qsim.rendering.fidelity import shortfall
 
     described = {job.name: folder / "clips" / job.name / "clip.json" for job in jobs}
-    found = {name: stated(files.read_json(path)) for name, path in described.items() if path.is_file()}
+    found = {name: stated(read_info(path)) for name, path in described.items() if path.is_file()}
     missed = {job.name: shortfall(found.get(job.name), job.settings.psnr) for job in jobs}
     return [f"{name} reached {why}" for name, why in missed.items() if why]
 

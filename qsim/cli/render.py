@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from qsim import checks
+from qsim import checks, records
 from qsim.backend import BACKENDS
 from qsim.cli.console import PILOT, RESUMES, bar, command, output, refuse_idle
 from qsim.cli.options import checked
@@ -86,7 +86,7 @@ def _run_render(args: argparse.Namespace) -> int:
     from qsim.clip.exr import HALF_MAX
     from qsim.dataset.scene_rendering import load_scene, render
     from qsim.optics.diffraction import diffraction_line
-    from qsim.rendering.budget import Finding, explain
+    from qsim.rendering.budget import explain
     from qsim.rendering.fidelity import choose_budget, shortfall
     from qsim.rendering.reuse.sharing import NAME as REUSE
     from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
@@ -110,8 +110,10 @@ def _run_render(args: argparse.Namespace) -> int:
         return 0
     with bar(args.output.name, first=PILOT) as progress:
         clip = render(args.scene, args.output, **taken, **size, progress=progress, force=args.force)
-    render_meta = clip.meta["render"]
-    found = stated(clip.meta)
+    info = clip.info
+    work = info.render
+    assert work is not None
+    found = stated(info)
     text = f"{clip.path}: {len(clip)} frames of {clip.shape[1]} x {clip.shape[2]}"
     text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
     text += f", {clip.mean_photons:.4g} photons per pixel"
@@ -119,24 +121,25 @@ def _run_render(args: argparse.Namespace) -> int:
         text += f"\n{played(scenes.load(args.scene, args.seed, args.speed))}"
     text += "" if found is None else f"\nerror: {found.line}"
     text += (missed := shortfall(found, args.psnr)) and f"\nerror: {missed}"
-    if "fireflies_per_frame" in clip.meta:
-        fireflies = sum(clip.meta["fireflies_per_frame"])
+    if info.fireflies_per_frame:
+        fireflies = sum(info.fireflies_per_frame)
         pixels = math.prod(clip.shape)
-        how = "before denoising" if render_meta["denoise"] else "not removed"
+        how = "before denoising" if work.denoise else "not removed"
         text += f"\n{fireflies} of {pixels} pixels are fireflies (Monte-Carlo outliers); {how}"
-    if cut := clip.meta["clipped_pixels"]:
+    if cut := info.clipped_pixels:
         text += f"\n{cut} of {math.prod(clip.shape)} pixels are brighter than {HALF_MAX:g}, the most a clip holds"
         text += (
             ": cut off there, and left out of the scores of quiver"
-            if "saturated_pixels" in clip.meta
+            if info.saturated_pixels is not None
             else ": cut off there"
         )
-    findings = [Finding(**finding) for finding in render_meta["findings"]]
-    if not args.explain and (args.reuse or render_meta["neighbours"]):
-        text += "".join(f"\n{explain([one])}" for one in findings if one.effect == REUSE)
+    if not args.explain and (args.reuse or work.neighbours):
+        text += "".join(f"\n{explain([one])}" for one in work.findings if one.effect == REUSE)
     if args.explain or clip.camera is None:
-        text += "\n" + explain(findings)
+        text += "\n" + explain(work.findings)
     else:
         text += "\n" + diffraction_line(clip.camera, clip.bands)
-    output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)
+    facts = records.plain(info, complete=True)
+    del facts["checksums"]
+    output(args, {"clip": str(clip.path)} | facts, text)
     return 0

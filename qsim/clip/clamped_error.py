@@ -12,11 +12,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.clip.clip_info import ClipInfo, ErrorInfo
 from qsim.colour import bright_end, psnr
 from qsim.optics.radiometry import WHITE_PER_MEAN
 
@@ -108,24 +108,27 @@ def measured(
     errors: Sequence[float],
     errors_at: Sequence[Sequence[Sequence[float]]],
     shares: bool = False,
-) -> dict[str, Any]:
-    """Return the fields of clip.json about the errors of a clip's frames.
+) -> ErrorInfo:
+    """Return what clip.json states of the errors of a clip's frames.
 
     `means` are the mean radiances of the frames, `high` is the 99.9th percentile of all. `errors` holds the plain error
     of each frame, `errors_at` its pairs (white, error). Where none reaches the white of the clip, the plain error
     is taken, which is never smaller. `shares` states whether the frames share samples.
     """
     white = white_of(math.fsum(means) / len(means), high)
-    found: dict[str, Any] = {"error_per_frame": list(errors), "white": white}
-    if white > 0:
-        own = [
-            error_at(white, pairs) if len(pairs) and white <= pairs[-1][0] else plain
-            for plain, pairs in zip(errors, errors_at, strict=True)
-        ]
-        found["error_at_white_per_frame"] = over_neighbours(own, means, shares)
-        found["psnr_of_truth"] = _stored(psnr(white, rms(np.array(own))))
-        found["psnr_unclamped"] = _stored(psnr(white, rms(np.array(errors))))
-    return found
+    if not white > 0:
+        return ErrorInfo(error_per_frame=tuple(errors), white=white)
+    own = [
+        error_at(white, pairs) if len(pairs) and white <= pairs[-1][0] else plain
+        for plain, pairs in zip(errors, errors_at, strict=True)
+    ]
+    return ErrorInfo(
+        error_per_frame=tuple(errors),
+        white=white,
+        error_at_white_per_frame=tuple(over_neighbours(own, means, shares)),
+        psnr_of_truth=_stored(psnr(white, rms(np.array(own)))),
+        psnr_unclamped=_stored(psnr(white, rms(np.array(errors)))),
+    )
 
 
 def _stored(decibels: float) -> float | None:
@@ -147,15 +150,13 @@ class Stated:
         return f"{self.psnr:.1f} dB below {self.below}, clamped there; {self.unclamped:.1f} dB unclamped"
 
 
-def stated(meta: dict[str, Any]) -> Stated | None:
+def stated(info: ClipInfo) -> Stated | None:
     """Return the PSNR of the radiance that clip.json holds; None if none was measured."""
-    psnr = meta.get("psnr_of_truth")
-    if psnr is None:
+    if info.psnr_of_truth is None or info.psnr_unclamped is None or info.white is None:
         return None
-    white = meta["white"]
-    by_mean = math.isclose(white, WHITE_PER_MEAN * meta["mean_radiance"], rel_tol=1e-6)
+    by_mean = math.isclose(info.white, WHITE_PER_MEAN * info.mean_radiance, rel_tol=1e-6)
     rule = f"{WHITE_PER_MEAN:g} x the mean" if by_mean else "the 99.9th percentile"
-    return Stated(psnr, meta["psnr_unclamped"], f"white ({rule})")
+    return Stated(info.psnr_of_truth, info.psnr_unclamped, f"white ({rule})")
 
 
 def frame_errors(errors: Callable[[float], float], white: float) -> tuple[tuple[float, float], ...]:

@@ -16,7 +16,6 @@ import functools
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -25,8 +24,9 @@ from numpy import ndarray as Array
 
 from qsim.checks import file_path
 from qsim.clip import exr
+from qsim.clip.clip_info import ClipInfo, frame_file
 from qsim.clip.lazy_array import LazyArray
-from qsim.clip.manifest import TRUTH, camera_of, read_manifest
+from qsim.clip.manifest import TRUTH, read_info
 from qsim.optics.camera import Camera
 from qsim.optics.radiometry import Crop, check_crop
 
@@ -36,12 +36,12 @@ class ClipFolder:
     """A complete clip folder; frames are read on demand."""
 
     path: Path
-    meta: dict[str, Any] = None  # type: ignore[assignment]  # clip.json, which `open` reads
+    info: ClipInfo = None  # type: ignore[assignment]  # clip.json, which `open` reads
     keeps: object = field(default=None, repr=False)  # a temporary folder: it lasts as long as a reference to it
 
     def __post_init__(self) -> None:
         """Raise `ValueError` where the name of a folder stands alone: `open` reads its description."""
-        if not isinstance(self.path, Path) or not isinstance(self.meta, dict):
+        if not isinstance(self.path, Path) or not isinstance(self.info, ClipInfo):
             kind = type(self).__name__
             raise ValueError(f"{kind}: a clip folder is opened by {kind}.open({str(self.path)!r})")
 
@@ -52,10 +52,10 @@ class ClipFolder:
         manifest = path / "clip.json"
         if not manifest.is_file():
             raise FileNotFoundError(_why_not(path))
-        return cls(path, read_manifest(manifest))
+        return cls(path, read_info(manifest))
 
     def __len__(self) -> int:
-        return int(self.meta["shape"][0])
+        return self.info.shape[0]
 
     def __getitem__(self, index: Any) -> Array:
         """Return radiance as an array [T, H, W] would: `clip[3]` is float32 [H, W], `clip[2:5]` is [3, H, W].
@@ -79,49 +79,46 @@ class ClipFolder:
 
     @property
     def name(self) -> str:
-        return str(self.meta.get("name") or self.path.name)
+        return self.info.name or self.path.name
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """(frames, height, width)."""
-        frames, height, width = self.meta["shape"]
-        return frames, height, width
+        return self.info.shape
 
     @property
     def bands(self) -> tuple[float, float, float] | None:
         """Wavelengths [m] of the bands R, G, B of a colour clip; None: one band, at the camera's wavelength."""
-        found = self.meta.get("bands")
-        return None if found is None else (float(found[0]), float(found[1]), float(found[2]))
+        return self.info.bands
 
     @property
     def frame_rate(self) -> float:
         """Frames per second of the scene's time."""
-        return float(self.meta["frame_rate"])
+        return self.info.frame_rate
 
     @property
     def exposure(self) -> float:
         """Seconds of light per frame."""
-        return float(self.meta["exposure"])
+        return self.info.exposure
 
     @property
     def times(self) -> Array | None:
         """When each frame was taken, as the source of an imported clip states it, float64 [T]; None if it does not.
 
-        `meta["times"]` also holds the unit and the source. Frames are at even times elsewhere.
+        `info.times` also holds the unit and the source. Frames are at even times elsewhere.
         """
-        found = self.meta.get("times")
-        return None if found is None else np.array(found["values"], np.float64)
+        times = self.info.times
+        return None if times is None else np.array(times.values, np.float64)
 
     @property
     def origin(self) -> tuple[int, int]:
         """(y, x) of the first pixel in the camera's frame: not (0, 0) if only a crop was rendered."""
-        y, x = self.meta.get("origin") or (0, 0)
-        return int(y), int(x)
+        return self.info.origin
 
     @property
     def mean_radiance(self) -> float:
-        """Mean over all frames, pixels and bands, in `meta["radiance_unit"]`."""
-        return float(self.meta["mean_radiance"])
+        """Mean over all frames, pixels and bands, in `info.radiance_unit`."""
+        return self.info.mean_radiance
 
     @property
     def mean_photons(self) -> float:
@@ -129,10 +126,9 @@ class ClipFolder:
 
         Of a colour clip it is the mean over the bands: the photons of one band.
         """
-        value = self.meta.get("mean_photons")
-        if value is None:
+        if self.info.mean_photons is None:
             raise ValueError(f"{self.path}: its radiance is relative and has no photons; give a target in PPP")
-        return float(value)
+        return self.info.mean_photons
 
     @property
     def strengths(self) -> dict[str, Array]:
@@ -140,12 +136,12 @@ class ClipFolder:
 
         `light0` is the first light of the scene, `body3` the glowing body of index 3. Empty without flicker.
         """
-        return {name: np.array(found["strength"]) for name, found in self.meta.get("flicker", {}).items()}
+        return {name: np.array(light.strength) for name, light in self.info.flicker.items()}
 
-    @cached_property
+    @property
     def camera(self) -> Camera | None:
         """The camera without its motion; None for relative radiance."""
-        return camera_of(self.meta, self.path / "clip.json")
+        return self.info.camera
 
     def require_one_band(self, what: str) -> None:
         """Raise `ValueError` for a colour clip; `what` needs a clip of one band."""
@@ -161,7 +157,7 @@ class ClipFolder:
 
     def sharp(self, t: int, crop: Crop | None = None) -> Array:
         """Return the radiance at mid-exposure, float32 [h, w], the target of restoration; `radiance` if not stored."""
-        return self._half("sharp" if f"sharp/{t:06d}.exr" in self.meta["checksums"] else "radiance", t, crop)
+        return self._half("sharp" if self.info.has("sharp", t) else "radiance", t, crop)
 
     def flow(self, t: int) -> Array:
         """Return flow, float32 [2, H, W] (u right, v down) [px]: p of frame t is at p + flow(p) in frame t + 1."""
@@ -187,19 +183,19 @@ class ClipFolder:
         """Return bool [h, w]: True where the light of frame t is a lower bound.
 
         The camera of an imported video was saturated, or light was above 65504, the largest half.
-        `meta["saturated_pixels"]` counts them over all frames; `meta["saturation"]` holds the pixel value.
+        `info.saturated_pixels` counts them over all frames; `info.saturation` holds the pixel value.
         """
         self._check_frame(t)
         _, height, width = self.shape
         y, x, h, w = (0, 0, height, width) if crop is None else check_crop(crop, height, width, str(self.path))
-        if f"saturated/{t:06d}.exr" not in self.meta["checksums"]:
+        if not self.info.has("saturated", t):
             return np.zeros((h, w), bool)
         return self._channel("saturated", t, "saturated")[y : y + h, x : x + w] != 0
 
     @property
     def has_truth(self) -> bool:
         """Whether flow, validity, depth and body indices were stored."""
-        return "truth/000000.exr" in self.meta["checksums"]
+        return self.info.has("truth", 0)
 
     def holds(self, channel: str) -> bool:
         """Return whether the ground truth has a channel: u and v of flow, bu and bv of flow_back, valid, Z, id."""
@@ -211,7 +207,7 @@ class ClipFolder:
         _, height, width = self.shape
         if crop is not None:
             check_crop(crop, height, width, str(self.path))
-        path = self.path / folder / f"{t:06d}.exr"
+        path = self.path / frame_file(folder, t)
         try:
             return exr.read_half(path, height, width, crop, colour=self.bands is not None)
         except FileNotFoundError:
@@ -226,16 +222,16 @@ class ClipFolder:
         """Return a channel [H, W] of frame t in a folder."""
         channels = self._channels(folder, t)
         if channel not in channels:
-            path = self.path / folder / f"{t:06d}.exr"
+            path = self.path / frame_file(folder, t)
             raise ValueError(f"{path}: has no channel '{channel}' ({TRUTH.get(channel, channel)})")
         return channels[channel]
 
     def _channels(self, folder: str, t: int) -> dict[str, Array]:
         """Return all channels [H, W] of frame t in a folder by name."""
         self._check_frame(t)
-        path = self.path / folder / f"{t:06d}.exr"
+        path = self.path / frame_file(folder, t)
         if not path.is_file():
-            kept = f"{folder}/{t:06d}.exr" in self.meta["checksums"]
+            kept = self.info.has(folder, t)
             why = f"the clip is damaged, run `qsim check {self.path}`" if kept else f"frame {t} has no ground truth"
             raise FileNotFoundError(f"{path}: no such file; {why}")
         status = path.stat()

@@ -9,7 +9,8 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -17,39 +18,57 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files, locks, scratch
+from qsim import descriptions, files, locks, records, scratch
 from qsim.arrays import plain
 from qsim.clip import clamped_error, exr
-from qsim.clip.manifest import FORMAT_VERSION, MEASURED, OURS, TRUTH, camera_of, check_new, check_replaced, target_of
+from qsim.clip.clip_info import ClipInfo, FrameFile, frame_file
+from qsim.clip.manifest import OURS, TRUTH, check_replaced, info_of, read_info, target_of
 from qsim.colour import bright_end
 from qsim.files import VERSION, check_name
+from qsim.kinds import Count, Digest, NotNegative
 from qsim.optics import radiometry
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameEntry:
+    """A finished frame, one line of journal.jsonl."""
+
+    t: Count
+    checksums: dict[FrameFile, Digest]
+    mean_radiance: NotNegative
+    mean_photons: NotNegative | None = None
+    largest: NotNegative  # radiance before it was rounded to halves
+    clipped: Count  # pixels whose light is a lower bound
+    saturated: Count | None = None  # the same, of imported frames and of those whose pixels are stored
+    error: NotNegative | None = None  # rms
+    errors_at: tuple[tuple[NotNegative, NotNegative], ...] = ()  # white, and the rms error clamped there
+    fireflies: Count | None = None
 
 
 class ClipWriter:
     """Writes a clip frame by frame to PATH.part and renames it when all frames are stored.
 
-    `meta` is clip.json without the measured fields (means, errors, checksums). It must hold shape, frame_rate,
-    exposure and radiance_unit, and camera (a dict) unless the unit is relative. A writer with the same meta resumes
-    where an interrupted one stopped: `has(t)` is true for its finished frames. `FileExistsError` if the clip exists and
-    `force` is not set, or if the folder is not a clip. `ValueError` if PATH.part holds files of another origin, or,
-    without `force`, frames of a clip with other meta; at the end also for light too small for half floats.
+    `info` describes the clip, as a record or as its values; what is measured (means, errors, checksums) is added. A
+    writer with an equal description resumes where an interrupted one stopped: `has(t)` is true for its finished frames.
+    `FileExistsError` if the clip exists and `force` is not set, or if the folder is not a clip. `ValueError` if
+    PATH.part holds files of another origin, or, without `force`, frames of a clip with another description; at the end
+    also for light too small for half floats.
     """
 
-    def __init__(self, path: str | os.PathLike[str], meta: dict[str, Any], *, force: bool = False) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], info: ClipInfo | Mapping[str, Any], *, force: bool = False
+    ) -> None:
         self.force = force
         self.name = check_name(Path(path).name)
         self.path = target_of(path, force)
-        self.meta = json.loads(files.to_json({"format_version": FORMAT_VERSION, "name": self.name} | meta))
-        check_new(self.path, self.meta)
+        self.info = replace(info_of(self.path, info), name=self.name)
         self.part = self.path.with_name(self.path.name + ".part")
-        self._camera = camera_of(self.meta, self.path)
-        self._frames: dict[int, dict[str, Any]] = {}
+        self._frames: dict[int, FrameEntry] = {}
         self._complete = False  # all frames and clip.json are stored
         self._lock = locks.Lock(self.part / "lock")
 
     def __enter__(self) -> ClipWriter:
-        identity = files.to_json(self.meta)
+        identity = files.to_json(self.info.asked)
         self._refuse_foreign()
         self.part.mkdir(parents=True, exist_ok=True)
         if not self._lock.acquire():
@@ -61,7 +80,8 @@ class ClipWriter:
                 files.write_bytes(begun, self._identity_before() or identity)
             self._complete = self._is_complete()
             if begun.read_bytes() != identity:
-                done = self._finished_meta()["shape"][0] if self._complete else len(_read_journal(self.part))
+                left = self._finished()
+                done = left.shape[0] if left is not None and self._complete else len(_read_journal(self.part))
                 if done and not self.force:
                     raise ValueError(
                         f"{self.part}: {done} frames exist, begun with other settings, or another scene; "
@@ -108,8 +128,8 @@ class ClipWriter:
 
         `ValueError` for radiance that is negative or not finite; it names frame and pixel.
         """
-        if not 0 <= t < self.meta["shape"][0]:
-            raise ValueError(f"{self.path}: frame {t} does not belong to a clip of {self.meta['shape'][0]} frames")
+        if not 0 <= t < self.info.shape[0]:
+            raise ValueError(f"{self.path}: frame {t} does not belong to a clip of {self.info.shape[0]} frames")
         radiance = plain(radiance)
         contents: dict[str, bytes] = {}
         half = self._encode(t, "radiance", radiance, contents)
@@ -118,14 +138,14 @@ class ClipWriter:
             self._encode(t, "sharp", sharp, contents)
             lower |= exr.above_half(sharp)
         if truth:
-            contents[f"truth/{t:06d}.exr"] = exr.encode(_truth_channels(truth), compress=True)
-        mask = f"saturated/{t:06d}.exr"
-        if lower.any() and self.meta.get("bands") is None:
+            contents[frame_file("truth", t)] = exr.encode(_truth_channels(truth), compress=True)
+        mask = frame_file("saturated", t)
+        if lower.any() and self.info.bands is None:
             contents[mask] = exr.encode({"saturated": lower.astype("<u4")}, compress=True)
         else:
             (self.part / mask).unlink(missing_ok=True)  # of an earlier writer
         earlier = self._frames.get(t)
-        if earlier and earlier["checksums"] == {name: files.sha256(content) for name, content in contents.items()}:
+        if earlier and earlier.checksums == {name: files.sha256(content) for name, content in contents.items()}:
             return
         checksums = {}
         for relative, content in contents.items():
@@ -133,35 +153,36 @@ class ClipWriter:
             target.parent.mkdir(exist_ok=True)
             checksums[relative] = files.write_bytes(target, content)
         stored = half.astype(np.float64)
-        entry: dict[str, Any] = {
-            "t": t,
-            "checksums": checksums,
-            "mean_radiance": float(stored.mean()),
-            "largest": float(radiance.max()),
-            "clipped": int(np.count_nonzero(lower)),
-        }
-        if saturated is not None or mask in contents:
-            entry["saturated"] = entry["clipped"]
-        if error is not None:
-            lost = float(np.sqrt(np.mean((stored - np.minimum(radiance, exr.HALF_MAX)) ** 2)))  # by rounding to halves
-            entry["error"] = math.hypot(error, lost)
-            entry["errors_at"] = [[float(white), math.hypot(at_white, lost)] for white, at_white in errors_at]
-        if fireflies is not None:
-            entry["fireflies"] = int(fireflies)
-        if self._camera is not None:
-            origin = tuple(self.meta.get("origin", (0, 0)))
-            bands = self.meta.get("bands")
-            exposure = self.meta["exposure"]
-            camera = self._camera.at(t / self.meta["frame_rate"])
-            photons = (
-                radiometry.expected_photons(stored, camera, exposure, origin=origin)
-                if bands is None
-                else radiometry.band_photons(stored, camera, exposure, bands, origin=origin)
-            )
-            entry["mean_photons"] = float(photons.mean())
+        lost = float(np.sqrt(np.mean((stored - np.minimum(radiance, exr.HALF_MAX)) ** 2)))  # by rounding to halves
+        clipped = int(np.count_nonzero(lower))
+        entry = FrameEntry(
+            t=t,
+            checksums=checksums,
+            mean_radiance=float(stored.mean()),
+            mean_photons=self._mean_photons(t, stored),
+            largest=float(radiance.max()),
+            clipped=clipped,
+            saturated=clipped if saturated is not None or mask in contents else None,
+            error=None if error is None else math.hypot(error, lost),
+            errors_at=tuple((float(white), math.hypot(at_white, lost)) for white, at_white in errors_at),
+            fireflies=None if fireflies is None else int(fireflies),
+        )
         self._frames[t] = entry
         self._complete = False
-        files.append_line(self.part / "journal.jsonl", json.dumps(entry, sort_keys=True).encode())
+        line = json.dumps(records.plain(entry), sort_keys=True)
+        files.append_line(self.part / "journal.jsonl", line.encode())
+
+    def _mean_photons(self, t: int, radiance: Array) -> float | None:
+        """Return the mean of the expected photons of frame t, radiance [H, W] or [3, H, W]; None without a camera."""
+        info = self.info
+        if info.camera is None:
+            return None
+        camera = info.camera.at(t / info.frame_rate)
+        if info.bands is None:
+            photons = radiometry.expected_photons(radiance, camera, info.exposure, origin=info.origin)
+        else:
+            photons = radiometry.band_photons(radiance, camera, info.exposure, info.bands, origin=info.origin)
+        return float(photons.mean())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -174,18 +195,17 @@ class ClipWriter:
         finally:
             self._lock.release()
 
-    def _finished_meta(self) -> dict[str, Any]:
-        """Return this clip's clip.json in .part, if the writer was killed during the rename; else empty."""
+    def _finished(self) -> ClipInfo | None:
+        """Return the description in .part of this clip, if the writer was killed during the rename."""
         with contextlib.suppress(OSError, ValueError):
-            left = files.read_json(self.part / "clip.json")
-            return left if left.get("name") == self.name else {}
-        return {}
+            left = read_info(self.part / "clip.json")
+            return left if left.name == self.name else None
+        return None
 
     def _identity_before(self) -> bytes:
         """Return begun.json of a .part whose writer was killed during the rename; empty: it was killed at the start."""
-        if left := self._finished_meta():
-            return files.to_json({key: value for key, value in left.items() if key not in MEASURED})
-        return b""
+        left = self._finished()
+        return b"" if left is None else files.to_json(left.asked)
 
     def _refuse_foreign(self) -> None:
         """Raise `ValueError` unless .part is free, or what a writer of a clip of this name left there."""
@@ -198,14 +218,16 @@ class ClipWriter:
         with contextlib.suppress(ValueError):
             known = begun.is_file() and files.read_json(begun).get("name") == self.name
             started = all(item.name == "lock" or scratch.is_scratch(item) for item in self.part.iterdir())
-            if known or started or self._finished_meta():
+            if known or started or self._finished() is not None:
                 return
         raise foreign
 
     def _is_complete(self) -> bool:
         """Return whether the clip is complete except for the rename."""
-        checksums = self._finished_meta().get("checksums", {})
-        return bool(checksums) and not any(files.differs(self.part / name, d) for name, d in checksums.items())
+        left = self._finished()
+        if left is None:
+            return False
+        return not any(files.differs(self.part / name, digest) for name, digest in left.checksums.items())
 
     def _clear(self) -> None:
         """Delete the files of an earlier writer; begun.json, which marks the folder as a writer's, stays."""
@@ -219,8 +241,8 @@ class ClipWriter:
 
     def _encode(self, t: int, folder: str, image: Array, contents: dict[str, bytes]) -> Array:
         """Add the image [H, W] of frame t as EXR to `contents`; return it in half precision."""
-        _, height, width = self.meta["shape"]
-        expected = (height, width) if self.meta.get("bands") is None else (3, height, width)
+        _, height, width = self.info.shape
+        expected = (height, width) if self.info.bands is None else (3, height, width)
         if image.shape != expected:
             raise ValueError(f"{self.path}: {folder} of frame {t} is {image.shape}, expected {expected}")
         bad = ~(np.isfinite(image) & (image >= 0))
@@ -232,7 +254,7 @@ class ClipWriter:
             )
         half = exr.to_half(image)
         channels = {"Y": half} if half.ndim == 2 else dict(zip("RGB", half, strict=True))
-        contents[f"{folder}/{t:06d}.exr"] = exr.encode(channels)
+        contents[frame_file(folder, t)] = exr.encode(channels)
         return half
 
     def _finish(self) -> None:
@@ -240,7 +262,7 @@ class ClipWriter:
 
         `FileExistsError` if the clip, or something else, exists by now and may not be replaced; .part stays complete.
         """
-        frames = self.meta["shape"][0]
+        frames = self.info.shape[0]
         missing = [t for t in range(frames) if not self.has(t)]
         if missing:
             raise ValueError(
@@ -248,7 +270,7 @@ class ClipWriter:
             )
         if not self._complete:
             self._check_light(frames)
-            self._write_meta(frames)
+            self._write_info(frames)
         if self.path.exists() and not self.force:
             raise FileExistsError(
                 f"{self.path}: appeared while this clip was made, which is complete in {self.part.name}; move it away "
@@ -264,7 +286,7 @@ class ClipWriter:
 
     def _check_light(self, frames: int) -> None:
         """Delete the frames and raise `ValueError` if halves hold their light in too few steps."""
-        largest = max(float(self._frames[t].get("largest", exr.SMALLEST)) for t in range(frames))
+        largest = max(self._frames[t].largest for t in range(frames))
         if 0 < largest < exr.SMALLEST:
             self._remove()
             raise ValueError(
@@ -272,34 +294,36 @@ class ClipWriter:
                 "multiply recorded light until its largest value is about 1, or brighten the scene"
             )
 
-    def _write_meta(self, frames: int) -> None:
-        """Write clip.json: the requested fields and the measured ones (MEASURED)."""
+    def _write_info(self, frames: int) -> None:
+        """Write clip.json: the description with what was measured."""
         entries = [self._frames[t] for t in range(frames)]
-        meta = dict(self.meta)
-        meta["mean_radiance"] = math.fsum(e["mean_radiance"] for e in entries) / frames
-        if self._camera is not None:
-            meta["mean_photons"] = math.fsum(e["mean_photons"] for e in entries) / frames
-        meta["clipped_pixels"] = sum(e["clipped"] for e in entries)
-        if any("saturated" in e for e in entries):
-            meta["saturated_pixels"] = sum(e.get("saturated", 0) for e in entries)
-        meta["checksums"] = {name: digest for e in entries for name, digest in e["checksums"].items()}
-        meta["software"] = _software()
-        if all("error" in e for e in entries):
-            errors = [e["error"] for e in entries]
-            errors_at = [e.get("errors_at", []) for e in entries]
-            means = [e["mean_radiance"] for e in entries]
-            shares = bool(self.meta.get("render", {}).get("neighbours"))
-            meta |= clamped_error.measured(means, self._high(), errors, errors_at, shares)
-        if all("fireflies" in e for e in entries):
-            meta["fireflies_per_frame"] = [e["fireflies"] for e in entries]
-        files.write_description(self.part / "clip.json", meta)
+        means = [entry.mean_radiance for entry in entries]
+        photons = [entry.mean_photons for entry in entries if entry.mean_photons is not None]
+        saturated = [entry.saturated for entry in entries if entry.saturated is not None]
+        fireflies = [entry.fireflies for entry in entries if entry.fireflies is not None]
+        info = replace(
+            self.info,
+            mean_radiance=math.fsum(means) / frames,
+            mean_photons=math.fsum(photons) / frames if photons else None,
+            clipped_pixels=sum(entry.clipped for entry in entries),
+            saturated_pixels=sum(saturated) if saturated else None,
+            fireflies_per_frame=tuple(fireflies) if len(fireflies) == frames else (),
+            checksums={name: digest for entry in entries for name, digest in entry.checksums.items()},
+            software=_software(),
+        )
+        errors = [entry.error for entry in entries if entry.error is not None]
+        if len(errors) == frames:
+            shares = self.info.render is not None and self.info.render.neighbours > 0
+            found = clamped_error.measured(means, self._high(), errors, [e.errors_at for e in entries], shares)
+            info = replace(info, **vars(found))
+        descriptions.write(self.part / "clip.json", info)
 
     def _high(self) -> float:
         """Return the 99.9th percentile of the radiance, over at most 4 million evenly spaced samples."""
-        frames, height, width = self.meta["shape"]
+        frames, height, width = self.info.shape
         step = max(1, math.isqrt(frames * height * width // 4_000_000))
-        colour = self.meta.get("bands") is not None
-        paths = [self.part / "radiance" / f"{t:06d}.exr" for t in range(frames)]
+        colour = self.info.bands is not None
+        paths = [self.part / frame_file("radiance", t) for t in range(frames)]
         samples = [exr.read_half(path, height, width, colour=colour)[..., ::step, ::step] for path in paths]
         return bright_end(np.stack(samples))
 
@@ -325,7 +349,7 @@ def _truth_channels(truth: dict[str, Array]) -> dict[str, Array]:
     return channels
 
 
-def _read_journal(part: Path) -> dict[int, dict[str, Any]]:
+def _read_journal(part: Path) -> dict[int, FrameEntry]:
     """Return the frames that an earlier writer finished; incomplete lines and files are dropped."""
     path = part / "journal.jsonl"
     if not path.is_file():
@@ -334,11 +358,11 @@ def _read_journal(part: Path) -> dict[int, dict[str, Any]]:
     kept = []
     for line in path.read_bytes().split(b"\n"):
         try:
-            entry = json.loads(line)
+            entry = records.convert(json.loads(line), FrameEntry, str(path))
         except ValueError:
             continue
-        if all((part / name).is_file() and files.sha256(part / name) == d for name, d in entry["checksums"].items()):
-            frames[int(entry["t"])] = entry
+        if not any(files.differs(part / name, digest) for name, digest in entry.checksums.items()):
+            frames[entry.t] = entry
             kept.append(line)
     files.write_bytes(path, b"".join(line + b"\n" for line in kept))
     return frames

@@ -129,16 +129,14 @@ def _seen_in(path: Path) -> dict[str, str]:
     from qsim.scenes.asset_folder import SUFFIXES
 
     try:
-        meta = Clip.open(path).meta
+        info = Clip.open(path).info
     except (ValueError, OSError):
         return {}
-    scene = meta.get("scene") or {}  # an imported clip has none
-    named = [f"scene {scene['family']}:{scene['seed']}"] if {"family", "seed"} <= scene.keys() else []
-    found = {asset.split(" ", 1)[-1]: asset for asset in [*named, *(meta.get("assets") or [])]}
-    reads = meta.get("reads")
-    for name, digest in reads.items() if isinstance(reads, dict) else ():
+    named = [] if info.scene is None else [f"scene {info.scene.family}:{info.scene.seed}"]  # an imported clip has none
+    found = {asset.split(" ", 1)[-1]: asset for asset in [*named, *info.assets]}
+    for name, digest in info.reads.items():
         if "*" not in name and Path(name).suffix.lower() in {*SUFFIXES, ".serialized"}:  # a pattern has no content
-            found[str(digest)] = f"file {name} (SHA-256 {digest})"
+            found[digest] = f"file {name} (SHA-256 {digest})"
     return found
 
 
@@ -185,9 +183,9 @@ def unproven(folder: Path, job: Job) -> str | None:
     place = folder / "clips" / job.name
     try:
         clip = Clip.open(place)
-        if files.read_json(path) != make_record(job, place) or clip.meta.get("job") != job.digest:
+        if files.read_json(path) != make_record(job, place) or clip.info.job != job.digest:
             return f"{path}: is not the record of this job and its clip"
-        for name in clip.meta["checksums"]:
+        for name in clip.info.checksums:
             if not (place / name).is_file() or (place / name).stat().st_size == 0:
                 return f"{place / name}: missing or empty"
         for sensing in job.streams:

@@ -11,6 +11,7 @@ from typing import Any
 
 from qsim import files
 from qsim.files import to_json
+from qsim.kinds import Split
 from qsim.sensor.defects import defect_table
 from qsim.streams.sensing import Sensing
 
@@ -40,7 +41,7 @@ class Job:
     family: str  # of the library, or the absolute path of a scene file or folder
     scene_seed: int
     speed: float  # factor on all motions
-    split: str
+    split: Split
     settings: Settings
     seed: int  # of the samples
     streams: tuple[Sensing, ...]

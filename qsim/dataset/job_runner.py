@@ -17,7 +17,7 @@ import platform
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,7 +61,7 @@ def render_job(job: Job, path: Path) -> object:
         shutter=settings.shutter,
         seed=render_seed(job),
         budget=choose_budget(job, scene),
-        extra=origin(job, read) | {"assets": sorted(assets(scene.to_dict()) + photographs(scene))},
+        made_of=replace(origin(job, read), assets=tuple(sorted(assets(scene.to_dict()) + photographs(scene)))),
         force=True,  # replaces an unfinished clip of an earlier version
     )
 
@@ -230,7 +230,7 @@ def _clip(job: Job, folder: Path, make: RenderJob) -> Clip:
         os.replace(work, path)
         files.sync_folder(path.parent)
     clip = Clip.open(path)
-    if clip.meta.get("job") != job.digest:
+    if clip.info.job != job.digest:
         raise ValueError(f"{path}: was made by another recipe; use another folder")
     return clip
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
+from qsim.clip.clip_info import Origin, SceneName
 from qsim.dataset.job import Job
 
 _ASSETS = {  # kind of a scene's record -> the key of its array or file, and the kind of asset
@@ -18,13 +18,13 @@ _ASSETS = {  # kind of a scene's record -> the key of its array or file, and the
 }
 
 
-def origin(job: Job, read: dict[str, str] | None = None) -> dict[str, Any]:
-    """Return the keys that a job adds to clip.json: its name and digest, its scene and split.
+def origin(job: Job, read: dict[str, str] | None = None) -> Origin:
+    """Return what a job states in clip.json: its digest, its scene and split.
 
     `read` maps the user's files that the scene reads to their SHA-256 (scene_files.py).
     """
-    scene = {"family": Path(job.family).stem, "seed": job.scene_seed, "speed": job.speed}
-    return {"name": job.name, "job": job.digest, "split": job.split, "scene": scene} | ({"reads": read} if read else {})
+    scene = SceneName(family=job.stem, seed=job.scene_seed, speed=job.speed)
+    return Origin(job=job.digest, split=job.split, scene=scene, reads=read or {})
 
 
 def nested(value: Any) -> Iterator[Any]:

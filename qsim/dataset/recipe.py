@@ -52,6 +52,7 @@ from typing import Any
 
 from qsim import checks, files
 from qsim.clip.clip_folder import ClipFolder
+from qsim.clip.clip_info import ClipInfo
 from qsim.dataset.job import FRAME_RATE, Job, Settings
 from qsim.dataset.recipe_sections.scenes_section import SETTINGS, jobs_of, settings_of
 from qsim.dataset.recipe_sections.streams_section import streams_of
@@ -180,15 +181,15 @@ def _check_streams(jobs: list[tuple[Job, Section]]) -> None:
 
 def _unrendered(name: str, settings: Settings, colour: bool) -> ClipFolder:
     """Return a clip of mean light 1 without frames, for the checks of sensing."""
-    meta = {
-        "name": name,
-        "shape": [settings.frames, settings.height, settings.width],
-        "frame_rate": settings.frame_rate,
-        "exposure": (settings.shutter or 1.0) / settings.frame_rate,
-        "mean_radiance": 1.0,
-        "bands": RGB if colour else None,
-    }
-    return ClipFolder(Path(name), meta)
+    info = ClipInfo(
+        name=name,
+        shape=(settings.frames, settings.height, settings.width),
+        frame_rate=settings.frame_rate,
+        exposure=(settings.shutter or 1.0) / settings.frame_rate,
+        mean_radiance=1.0,
+        bands=RGB if colour else None,
+    )
+    return ClipFolder(Path(name), info)
 
 
 def _kept(value: Any) -> Any:

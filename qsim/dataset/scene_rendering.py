@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from qsim import checks
+from qsim.clip.clip_info import Origin
 from qsim.clip.manifest import target_of
 from qsim.dataset import scene_files
 from qsim.files import NAME, Progress
@@ -88,7 +89,7 @@ def render(
         seed=seed,
         budget=budget,
         progress=progress,
-        extra={"reads": read} if read else None,
+        made_of=Origin(reads=read),
         force=force,
     )
     return replace(clip, keeps=temporary)

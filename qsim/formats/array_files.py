@@ -20,6 +20,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import check_shape
+from qsim.clip.source import Source
 from qsim.colour import luminance, to_linear
 from qsim.file_order import numbered
 from qsim.files import decoding_errors, load_array
@@ -80,8 +81,9 @@ def read_cube(path: Path, hints: Hints) -> Recording:
         return np.unpackbits(np.asarray(array[start:stop]), axis=-1, count=width)
 
     stated = known.get("orientation")
-    meta = {"bit_order": "msb"} | ({"orientation": stated} if isinstance(stated, str) else {})
-    return Recording((frames, height, width), read, "photon cube", 1, meta=meta)
+    orientation = stated if isinstance(stated, str) else ""
+    source = Source(format="photon cube", bit_order="msb", orientation=orientation)
+    return Recording((frames, height, width), read, source, 1)
 
 
 def written_with(path: Path, description: str) -> dict[str, Any] | None:
@@ -118,7 +120,7 @@ def read_light_npy(path: Path, hints: Hints) -> Recording:
 
 
 def codes_of(
-    path: Path, values: Values, source: str, hints: Hints, *, stated: str | None = None, bits: int | None = None
+    path: Path, values: Values, form: str, hints: Hints, *, stated: str | None = None, bits: int | None = None
 ) -> Recording:
     """Return an array as codes of one bit (bool) or of the stated bits; its axes by --axes, else as `stated`."""
     reading = axes.named(path, values.shape, hints, stated)
@@ -132,10 +134,10 @@ def codes_of(
     def read(start: int, stop: int) -> Array:
         return checked_codes(path, reading.turned(np.asarray(values.read(reading.block(start, stop)))), bits, start)
 
-    return Recording(shape, read, source, bits, reading=reading.said)
+    return Recording(shape, read, Source(format=form), bits, reading=reading.said)
 
 
-def light_of(path: Path, values: Values, source: str, hints: Hints) -> Recording:
+def light_of(path: Path, values: Values, form: str, hints: Hints) -> Recording:
     """Return an array as light, in colour as luminance; its axes by --axes."""
     reading = axes.named(path, values.shape, hints)
     full_shape = reading.shape(values.shape)
@@ -156,7 +158,7 @@ def light_of(path: Path, values: Values, source: str, hints: Hints) -> Recording
         light = found.astype(np.float32) if floats and transfer == "linear" else to_linear(found, transfer, top)
         return luminance(light) if reading.colour else light, reached(found, white, reading.colour)
 
-    found = light_recording(path, shape, marked, source, {"transfer": transfer}, hints, full)
+    found = light_recording(path, shape, marked, Source(format=form, transfer=transfer), hints, full)
     return replace(found, reading=reading.said)
 
 
@@ -195,7 +197,7 @@ def read_zarr(path: Path, hints: Hints) -> Recording:
         with decoding_errors(path, "zarr"), zarr.config.set({"async.concurrency": 1}):  # one chunk in memory at a time
             return checked_codes(path, np.asarray(array[start:stop]), bits, start)
 
-    return Recording(shape, read, "zarr", bits, meta={"attributes": attributes})
+    return Recording(shape, read, Source(format="zarr", attributes=attributes), bits)
 
 
 def _zarr_codecs(path: Path, folder: Path) -> set[str]:
@@ -287,8 +289,8 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
         return checked_codes(path, joined, bits, start)
 
     model = "binary_sum" if packed else "binary_sum_static"
-    meta = {"bit_order": "msb"} | ({} if planes in (None, 2**bits - 1) else {"bitplanes": planes})
-    return Recording(shape, read, "visionsim", bits, model, meta)
+    odd = None if planes == 2**bits - 1 else planes
+    return Recording(shape, read, Source(format="visionsim", bit_order="msb", bitplanes=odd), bits, model)
 
 
 def _bits_of_sums(path: Path, planes: int, bits: int | None) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files, scratch
+from qsim import files, records, scratch
 from qsim.clip.manifest import check_outside
 from qsim.colour import code_levels, peak
 from qsim.files import VERSION
@@ -95,12 +95,12 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
         about = f"{source.bits}-bit codes" + (", stretched to 0..255" if meta.get("stretched") else "")
     elif "white" in meta:
         bits = _depth(source, wanted)
-        about = f"light in {bits} bits by {meta['transfer']}, white {meta['white']:.4g} {source.meta['radiance_unit']}"
+        about = f"light in {bits} bits by {meta['transfer']}, white {meta['white']:.4g} {source.info.radiance_unit}"
     else:
-        about = f"linear light in {source.meta['radiance_unit']}"
+        about = f"linear light in {source.info.radiance_unit}"
     if isinstance(source, Clip):
         about += "; not written: codes, flow, depth (--to pairs writes codes, truth and flow)"
-    rate = float(source.meta["frame_rate"])
+    rate = source.frame_rate if isinstance(source, Clip) else float(source.meta["frame_rate"])
     if wanted.kind == "challenge":
         return made, f"challenge, {challenge.line(meta)}"
     return made, f"{wanted.kind}, {frames} frames of {height} x {width} pixels at {rate:g} per second{shown}, {about}"
@@ -162,16 +162,13 @@ def _nerfstudio(source: Any, path: Path, wanted: Export, meta: dict[str, Any]) -
 def camera_file(clip: Clip) -> dict[str, Any]:
     """Return the content of a transforms.json of a clip: its camera, and a pose per frame named 000000.png and so on.
 
-    `ValueError` for a clip without a camera, with less than two frames, and for one whose poses were not stored.
+    `ValueError` for a clip without a camera, and with less than two frames.
     """
     if clip.camera is None:
         raise ValueError(f"{clip.path}: has no camera (imported video); only rendered clips have poses")
     if len(clip) < 2:
         raise ValueError(f"{clip.path}: has one frame; a camera path needs two or more")
-    poses = clip.meta.get("poses") or [clip.camera.pose()] * len(clip)
-    moved = clip.meta["camera"].get("motion") is not None
-    if len(poses) != len(clip) or (moved and "poses" not in clip.meta):
-        raise ValueError(f"{clip.path}: its camera moves, and clip.json lacks a pose for each frame; render it again")
+    poses = [np.array(pose) for pose in clip.info.poses] or [clip.camera.pose()] * len(clip)
     height, width = clip.shape[1:]
     names = [f"{t:06d}.png" for t in range(len(clip))]
     return camera_path(clip.camera, poses, names, clip.frame_rate, clip.origin) | {"w": width, "h": height}
@@ -226,7 +223,10 @@ EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
 
 
 def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
-    meta = source.meta
+    if isinstance(source, Clip):
+        facts = {key: value for key, value in records.plain(source.info, complete=True).items() if value is not None}
+    else:
+        facts = source.meta
     keys = (
         "shape",
         "frame_rate",
@@ -252,9 +252,9 @@ def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
         "origin",
         "diffraction",
     )
-    found = {key: meta[key] for key in keys if key in meta}
+    found = {key: facts[key] for key in keys if key in facts}
     found |= {"format_version": 1, "bit_order": "msb", "software": {"qsim": VERSION}}
-    found["orientation"] = orientation(meta)
+    found["orientation"] = source.info.orientation if isinstance(source, Clip) else orientation(source.meta)
     if isinstance(source, Clip):
         written = {"exr": "linear", "zarr": "linear", "challenge": "srgb"}
         found["transfer"] = written.get(wanted.kind, wanted.transfer)

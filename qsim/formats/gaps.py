@@ -160,10 +160,10 @@ def _filled(recording: Recording, found: Gaps) -> Recording:
         return marked(start, stop)[0]
 
     reading = "; ".join(filter(None, (recording.reading, f"{found.total} lost frames are stored as missing")))
-    meta = recording.meta | {"missing_frames": missing}
+    source = replace(recording.source, missing_frames=tuple(missing))
     times = recording.times
     assert times is not None
     whole = replace(times, values=tuple(np.interp(range(total), place, times.values).tolist()))
     return replace(
-        recording, shape=(total, height, width), read=read, marked=marked, meta=meta, reading=reading, times=whole
+        recording, shape=(total, height, width), read=read, marked=marked, source=source, reading=reading, times=whole
     )

@@ -17,6 +17,7 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.checks import check_shape
 from qsim.clip import exr
+from qsim.clip.source import Source
 from qsim.colour import from_linear, luminance, to_linear
 from qsim.file_order import numbered, places
 from qsim.files import decoding_errors
@@ -138,16 +139,17 @@ def read_tiff(path: Path, hints: Hints) -> Recording:
     return replace(recording, reading=said, times=gaps.of_names(found) if alone else None)
 
 
-def picture(path: Path, shape: tuple[int, int, int], raw: Any, first: Page, source: str, hints: Hints) -> Recording:
+def picture(path: Path, shape: tuple[int, int, int], raw: Any, first: Page, form: str, hints: Hints) -> Recording:
     """Return pictures as codes if they have 1 bit or --bits is given, else as light by --transfer.
 
     Pictures of 2 to 7 bits are codes of their depth unless a transfer curve or a white is given. `ValueError` if codes
     exceed 2^bits - 1, as codes stretched to 0 ... 255 do.
     """
-    meta: dict[str, Any] = {}
+    source = Source(format=form)
     reading = ""
     if first.orientation != 1:
-        meta["orientation"] = f"upright: turned by its orientation tag {first.orientation}"
+        turn = f"turned by its orientation tag {first.orientation}"
+        source = replace(source, orientation=f"upright: {turn}")
         reading = f"turned upright by its orientation tag {first.orientation}"
     one_bit = first.depth == 1
     colour = first.pixels.ndim == 3
@@ -169,7 +171,7 @@ def picture(path: Path, shape: tuple[int, int, int], raw: Any, first: Page, sour
                 return _unstretch(path, values, top, start, full)
             return checked_codes(path, values, bits, start)
 
-        return Recording(shape, read_codes, source, bits, meta=meta, reading=reading)
+        return Recording(shape, read_codes, source, bits, reading=reading)
     if first.pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: pixels of {first.pixels.dtype}; pictures of up to 16 bits are read")
     transfer = need_transfer(path, hints)
@@ -179,7 +181,7 @@ def picture(path: Path, shape: tuple[int, int, int], raw: Any, first: Page, sour
         values = raw(start, stop)
         return to_luminance(values, transfer, full, values.ndim == 4), reached(values, white, values.ndim == 4)
 
-    found = light_recording(path, shape, marked, source, meta | {"transfer": transfer}, hints, full)
+    found = light_recording(path, shape, marked, replace(source, transfer=transfer), hints, full)
     return replace(found, reading=reading)
 
 

@@ -18,15 +18,18 @@ from typing import Any, cast
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files
+from qsim import files, records
 from qsim.checks import file_path
 from qsim.clip import exr
-from qsim.clip.manifest import RELATIVE, check_outside
+from qsim.clip.clip_info import RELATIVE, ClipInfo, Saturation
+from qsim.clip.manifest import check_outside
+from qsim.clip.source import Source
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
 from qsim.formats import gaps
 from qsim.formats.detection import ASSUMED, LAYOUTS, detect
 from qsim.formats.recording import Hints, Marked, Recording, reoriented, with_stated_layout
+from qsim.kinds import Split
 from qsim.sensor import colour_filter, devices, packing
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
@@ -56,7 +59,7 @@ def read(path: Path | str, hints: Hints | None = None, *, compared: tuple[str, .
         given = getattr(hints, field.name) != field.default
         if given and field.name not in asked:
             raise ValueError(
-                f"{path}: --{field.name.replace('_', '-')} changes nothing for {recording.source}; leave it out"
+                f"{path}: --{field.name.replace('_', '-')} changes nothing for {recording.format}; leave it out"
             )
     if layout in ASSUMED:
         recording = with_stated_layout(recording, *ASSUMED[layout])
@@ -83,7 +86,7 @@ class Import:
     exposure: float | None = None  # s; None: the whole frame
     sensor: str | None = None  # of codes: a name of qsim.devices, or a .toml file
     ppp: float | None = None  # of codes: mean light level, where the sensor's gain follows it
-    split: str | None = None  # of light: train, val or test
+    split: Split | None = None  # of light: train, val or test
 
     def __post_init__(self) -> None:
         if not 0 < self.frame_rate < float("inf"):
@@ -107,28 +110,27 @@ def to_clip(
     """
     if not recording.is_light:
         raise ValueError(
-            f"{path}: {recording.source} holds codes, not light; name a stream to make, as in out/capture.npy"
+            f"{path}: {recording.format} holds codes, not light; name a stream to make, as in out/capture.npy"
         )
     if capture.sensor is not None or capture.ppp is not None:
         name = "sensor" if capture.sensor is not None else "ppp"
-        raise ValueError(f"{path}: {recording.source} holds light, which no sensor made; leave --{name} out")
+        raise ValueError(f"{path}: {recording.format} holds light, which no sensor made; leave --{name} out")
     check_outside(path)
     capture = _as_stated(path, recording, capture)
     recording = _within_halves(recording)
     frames, height, width = recording.shape
-    meta: dict[str, Any] = {
-        "shape": [frames, height, width],
-        "frame_rate": capture.frame_rate,
-        "shutter": capture.seconds * capture.frame_rate,
-        "exposure": capture.seconds,
-        "radiance_unit": RELATIVE,
-        "camera": None,
-        "source": {"format": recording.source} | recording.meta,
-        "split": capture.split,
-        "saturation": {"white": recording.white, "assumed": recording.white_assumed},
-    } | _times_of(recording)
+    info = ClipInfo(
+        shape=(frames, height, width),
+        frame_rate=capture.frame_rate,
+        shutter=capture.seconds * capture.frame_rate,
+        exposure=capture.seconds,
+        source=recording.source,
+        split=capture.split,
+        saturation=Saturation(white=recording.white, assumed=recording.white_assumed),
+        times=recording.times,
+    )
     marked = recording.marked or _unmarked(recording)
-    with ClipWriter(path, meta, force=force) as writer:
+    with ClipWriter(path, info, force=force) as writer:
         for start, stop in _ranges(recording):
             for t, image, mask in zip(range(start, stop), *marked(start, stop), strict=True):
                 writer.add(t, image, saturated=mask)
@@ -140,7 +142,7 @@ def to_clip(
 def _within_halves(recording: Recording) -> Recording:
     """Return light in a unit in which half floats hold it: floats beyond their range are scaled by a power of 2.
 
-    `scale` in the meta is the light of the clip over that of the file.
+    `scale` of its source is the light of the clip over that of the file.
     """
     if recording.full_scale:
         return recording
@@ -157,8 +159,8 @@ def _within_halves(recording: Recording) -> Recording:
 
     said = f"light of up to {largest:g} is scaled by {scale:g}, because clips hold half floats"
     reading = "; ".join(filter(None, (recording.reading, said)))
-    meta = recording.meta | {"scale": scale}
-    return replace(recording, read=lambda a, b: scaled(a, b)[0], marked=scaled, meta=meta, reading=reading)
+    source = replace(recording.source, scale=scale)
+    return replace(recording, read=lambda a, b: scaled(a, b)[0], marked=scaled, source=source, reading=reading)
 
 
 def _unmarked(recording: Recording) -> Marked:
@@ -173,20 +175,19 @@ def _unmarked(recording: Recording) -> Marked:
 
 def saturation_line(clip: Clip) -> str:
     """Return a line about the saturation of an imported clip: its white and the share of saturated pixels."""
-    known = clip.meta.get("saturation") or {"white": None, "assumed": True}
-    missing = len((clip.meta.get("source") or {}).get("missing_frames", ()))
-    white = known["white"]
-    count = int(clip.meta.get("saturated_pixels") or 0) - missing * math.prod(clip.shape[1:])
+    known = clip.info.saturation or Saturation(assumed=True)
+    source = clip.info.source or Source()
+    white = known.white
+    count = (clip.info.saturated_pixels or 0) - len(source.missing_frames) * math.prod(clip.shape[1:])
     share = f"{100 * count / math.prod(clip.shape):.3g} % of pixels"
-    scale = (clip.meta.get("source") or {}).get("scale")
-    cut = "" if scale is None else f"; the light of the file is scaled by {scale:g}"
+    cut = "" if source.scale is None else f"; the light of the file is scaled by {source.scale:g}"
     if white is None:
         return "saturation not known: floats have no largest value; give it with --white" + cut
-    said = f"white {white:g}{' assumed' if known['assumed'] else ''}"
+    said = f"white {white:g}{' assumed' if known.assumed else ''}"
     if count:
         return f"{said}: {share} saturated{cut}"
     return f"{said}: no pixel reaches it{cut}" + (
-        "; if the camera saturates below it, give --white" if known["assumed"] else ""
+        "; if the camera saturates below it, give --white" if known.assumed else ""
     )
 
 
@@ -199,10 +200,10 @@ def to_stream(
     """
     if recording.bits is None:
         raise ValueError(
-            f"{path}: {recording.source} holds light, not codes; name a clip folder to make, as in out/clip"
+            f"{path}: {recording.format} holds light, not codes; name a clip folder to make, as in out/clip"
         )
     if capture.split is not None:
-        raise ValueError(f"{path}: --split is stored in clips, and {recording.source} becomes a stream; leave it out")
+        raise ValueError(f"{path}: --split is stored in clips, and {recording.format} becomes a stream; leave it out")
     if capture.ppp is not None and capture.sensor is None:
         raise ValueError(f"{path}: --ppp sets the gain of a named sensor; name it with --sensor, or leave --ppp out")
     device = devices.DEVICES.get(str(capture.sensor))
@@ -219,9 +220,9 @@ def to_stream(
                 f"{file}: is not a stream, which is all that --force replaces; move it away, or name another"
             )
     frames, height, width = recording.shape
-    if "bitplanes" in recording.meta:
+    if recording.source.bitplanes is not None:
         raise ValueError(
-            f"{path}: sums of {recording.meta['bitplanes']} bitplanes; codes of a stream are sums of 2^b - 1, as 3, "
+            f"{path}: sums of {recording.source.bitplanes} bitplanes; codes of a stream are sums of 2^b - 1, as 3, "
             "7 or 15"
         )
     capture = _as_stated(path, recording, capture)
@@ -237,7 +238,7 @@ def to_stream(
 
     meta = {
         "shape": [frames, height, width],
-        "orientation": recording.meta.get("orientation", "unknown"),  # upright only if a reader states it
+        "orientation": recording.source.orientation or "unknown",  # upright only if a reader states it
         "code_model": model,
         "planes_per_code": 2**recording.bits - 1 if model == "binary_sum" else 1,
         "frame_rate": capture.frame_rate,
@@ -248,14 +249,14 @@ def to_stream(
         "radiance_unit": RELATIVE,
         "transfer": "linear",
         "seed": None,
-        "source": {"format": recording.source} | recording.meta,
+        "source": records.plain(recording.source),
     } | _times_of(recording)
     return write_packed(npy, packed(), sensor, meta | tables)
 
 
 def _times_of(recording: Recording) -> dict[str, Any]:
     """Return the table `times` of a description, if the source states when each frame was taken."""
-    return {} if recording.times is None else {"times": recording.times.to_dict()}
+    return {} if recording.times is None else {"times": records.plain(recording.times)}
 
 
 def _as_stated(path: Path, recording: Recording, capture: Import) -> Import:
@@ -267,7 +268,7 @@ def _as_stated(path: Path, recording: Recording, capture: Import) -> Import:
     given = (("frame-rate", capture.frame_rate, rate), ("exposure", capture.exposure or exposure, exposure))
     for name, value, stated in given:
         if not math.isclose(value, stated, rel_tol=1e-6):
-            raise ValueError(f"{path}: --{name} {value:g}: {recording.source} state {stated:g}; leave it out")
+            raise ValueError(f"{path}: --{name} {value:g}: {recording.format} state {stated:g}; leave it out")
     return replace(capture, exposure=exposure)
 
 

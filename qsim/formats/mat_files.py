@@ -9,6 +9,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.checks import check_shape
+from qsim.clip.source import Source
 from qsim.file_order import numbered
 from qsim.files import decoding_errors
 from qsim.formats.recording import Hints, Recording, checked_codes
@@ -45,7 +46,7 @@ def read_mat(path: Path, hints: Hints) -> Recording:
     planes = np.concatenate(parts)
     bits = hints.bits or 1
     codes = checked_codes(path, planes, bits, 0)
-    return Recording(check_shape(path, codes.shape), lambda a, b: codes[a:b], "SwissSPAD .mat", bits)
+    return Recording(check_shape(path, codes.shape), lambda a, b: codes[a:b], Source(format="SwissSPAD .mat"), bits)
 
 
 def mat_array(path: Path, variable: str | None = None) -> Array:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import check_shape
+from qsim.clip.source import Source
 from qsim.files import decoding_errors
 from qsim.formats.recording import Hints, Recording
 from qsim.sensor.defects.event_simulation import DETECTED, RELEASED
@@ -162,10 +163,11 @@ def read_photons(path: Path, hints: Hints) -> Recording:
     codes = fired.sum(axis=1, dtype=np.uint8)
     rate = photons.frame_rate
     exposure = photons.exposure
-    meta = {} if photons.rows is None else {"rows": photons.rows.to_dict()}
-    shape = photons.shape
-    name = "photon times"
-    return Recording(shape, lambda a, b: codes[a:b], name, bits, meta=meta, frame_rate=rate, exposure=exposure)
+    rows = photons.rows
+    source = Source(format="photon times")
+    if rows is not None:
+        source = replace(source, row_delay=rows.delay, row_order=rows.order)
+    return Recording(photons.shape, lambda a, b: codes[a:b], source, bits, frame_rate=rate, exposure=exposure)
 
 
 def _arrays(path: Path) -> dict[str, Array]:

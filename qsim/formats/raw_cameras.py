@@ -1,7 +1,7 @@
 """Reads raw files of photon counting and spike cameras, binary planes as streams of bits, and writes those of spikes.
 
 Each reader takes a path and the user's hints and returns a `Recording` of codes. The order of bits, rows and halves is
-not in these files; it is stated in the reader's docstring and in `meta`.
+not in these files; it is stated in the reader's docstring and in `source`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import check_shape
+from qsim.clip.source import Source
 from qsim.formats.raw_layout import raw_files
 from qsim.formats.recording import Hints, Recording, check_size
 
@@ -34,8 +35,8 @@ def read_swissspad2_half(path: Path, _hints: Hints) -> Recording:
         return np.unpackbits(raw, bitorder="little").reshape(-1, *HALF)
 
     # Two independent readers (python-spad, quanta_SL) agree on bits and rows; the orientation is not in a file.
-    meta = {"bit_order": "lsb", "orientation": "as stored"}
-    return _raw(files, counts, RAW_FRAME // 2, HALF, decode, "SwissSPAD2 half array", meta)
+    source = Source(format="SwissSPAD2 half array", bit_order="lsb", orientation="as stored")
+    return _raw(files, counts, RAW_FRAME // 2, HALF, decode, source)
 
 
 def read_swissspad2_full(path: Path, _hints: Hints) -> Recording:
@@ -51,8 +52,9 @@ def read_swissspad2_full(path: Path, _hints: Hints) -> Recording:
         return np.concatenate([top, bottom], axis=1)
 
     # As photoncube: each half from its outer row inwards. The camera's orientation is not in a file.
-    meta = {"bit_order": "lsb", "orientation": "as stored, the bottom half turned: it is stored upside down"}
-    return _raw(files, counts, RAW_FRAME, FULL, decode, "SwissSPAD2 full array", meta)
+    orientation = "as stored, the bottom half turned: it is stored upside down"
+    source = Source(format="SwissSPAD2 full array", bit_order="lsb", orientation=orientation)
+    return _raw(files, counts, RAW_FRAME, FULL, decode, source)
 
 
 def read_spad512s(path: Path, _hints: Hints) -> Recording:
@@ -68,8 +70,8 @@ def read_spad512s(path: Path, _hints: Hints) -> Recording:
         return np.unpackbits(raw).reshape(-1, *FULL)
 
     # Both public readers agree on bits and rows, one of them mirrored; a file does not state which is right.
-    meta = {"bit_order": "msb", "orientation": "as stored, left and right are disputed", "flip_lr": "unknown"}
-    return _raw(files, counts, RAW_FRAME, FULL, decode, "SPAD512S", meta)
+    source = Source(format="SPAD512S", bit_order="msb", orientation="as stored, left and right are disputed")
+    return _raw(files, counts, RAW_FRAME, FULL, decode, source)
 
 
 def read_spike(path: Path, hints: Hints) -> Recording:
@@ -98,8 +100,8 @@ def read_spike(path: Path, hints: Hints) -> Recording:
         return np.unpackbits(raw, bitorder="little").reshape(-1, height, width)[:, ::-1]
 
     # On published streams this bit order gives the smoother frames; flipped, they agree with their ground truth.
-    meta = {"bit_order": "lsb", "orientation": "stored upside down, turned upright"}
-    return _raw([path], [count], frame, (height, width), decode, "spike camera", meta)
+    source = Source(format="spike camera", bit_order="lsb", orientation="stored upside down, turned upright")
+    return _raw([path], [count], frame, (height, width), decode, source)
 
 
 def write_spike(path: Path, blocks: Iterator[Array], shape: tuple[int, int, int]) -> None:
@@ -129,7 +131,7 @@ def _roughness(planes: Array) -> float:
 
 
 def _raw(
-    files: list[Path], counts: list[int], frame_bytes: int, size: tuple[int, int], decode: Any, source: str, meta: Any
+    files: list[Path], counts: list[int], frame_bytes: int, size: tuple[int, int], decode: Any, source: Source
 ) -> Recording:
     ends = np.cumsum(counts)
 
@@ -143,4 +145,4 @@ def _raw(
                 parts.append(decode(raw))
         return np.concatenate(parts)
 
-    return Recording((int(ends[-1]), *size), read, source, 1, meta=meta)
+    return Recording((int(ends[-1]), *size), read, source, 1)

@@ -21,6 +21,7 @@ from numpy import ndarray as Array
 
 from qsim import checks
 from qsim.checks import check_shape
+from qsim.clip.source import Source
 from qsim.file_order import numbered
 from qsim.formats import gaps
 from qsim.formats.recording import Hints, Recording, check_size, values_recording
@@ -197,9 +198,9 @@ def read_mraw(path: Path, hints: Hints) -> Recording:
     rate = _number(beside, "rate", facts)
     shutter = _number(beside, "shutter", facts)
     exposure = shutter if shutter < 1 else 1 / shutter  # stated as seconds, or as the n of 1/n s
-    meta = {"camera": facts["camera"], "exposure_stated": exposure}
+    source = replace(recording.source, camera=facts["camera"], exposure_stated=exposure)
     said = f"{recording.reading}; {rate:g} frames per second, exposure {exposure:g} s (shutter {facts['shutter']})"
-    return replace(recording, reading=said, meta=recording.meta | meta, frame_rate=rate, exposure=exposure)
+    return replace(recording, reading=said, source=source, frame_rate=rate, exposure=exposure)
 
 
 # The name of a fact, its path in a .cihx, and its name in a .cih.
@@ -309,9 +310,9 @@ def raw_files(path: Path) -> list[Path]:
     return found
 
 
-def _recording(path: Path, files: list[Path], layout: Layout, source: str, hints: Hints) -> Recording:
+def _recording(path: Path, files: list[Path], layout: Layout, form: str, hints: Hints) -> Recording:
     check_shape(path, (1, layout.height, layout.width))
-    what = f"{source} ({layout.said})"
+    what = f"{form} ({layout.said})"
     counts = []
     for file in files:
         size = file.stat().st_size - layout.skip
@@ -335,6 +336,6 @@ def _recording(path: Path, files: list[Path], layout: Layout, source: str, hints
 
     shape = (int(ends[-1]), layout.height, layout.width)
     order = layout.order or f"none: {layout.said}"
-    meta = {"bit_order": order, "orientation": "as stored", "raw_layout": layout.said}
+    source = Source(format=form, bit_order=order, orientation="as stored", raw_layout=layout.said)
     reading = f"read as {shape[0]} frames of {layout.said}"
-    return replace(values_recording(path, shape, raw, layout.bits, source, meta, hints), reading=reading)
+    return replace(values_recording(path, shape, raw, layout.bits, source, hints), reading=reading)

@@ -8,31 +8,17 @@ are compared with the size of the file before memory is allocated. Errors and wa
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
+from qsim.clip.source import Flip, Source, Times
 from qsim.colour import TRANSFERS, to_linear
 
 Marked = Callable[[int, int], tuple[Array, Array]]
-
-
-@dataclass(frozen=True)
-class Times:
-    """When each frame was taken, as its source states it."""
-
-    values: tuple[float, ...]  # rising
-    unit: str  # s, or frames for numbers
-    source: str  # what states them, in words
-    tick: float = 0.0  # to which they are rounded
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the table `times` of clip.json and of streams."""
-        return {"unit": self.unit, "source": self.source, "values": list(self.values)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +27,9 @@ class Recording:
 
     shape: tuple[int, int, int]
     read: Callable[[int, int], Array]  # frames start ... stop - 1: codes (uint8, uint16), or light (float32)
-    source: str  # the format it came from
+    source: Source  # its format, further facts of the file, and assumptions of its reader
     bits: int | None = None  # of codes; None: light
     code_model: str = "binary_sum"
-    meta: dict[str, Any] = field(default_factory=dict)  # further facts of the file, and assumptions of its reader
     marked: Marked | None = None  # light, and bool [t, H, W]: True where the camera was saturated
     white: float | None = None  # pixel value at which the camera saturates; None: not known
     white_assumed: bool = False  # it is the largest value that the pixels can hold
@@ -63,6 +48,11 @@ class Recording:
             object.__setattr__(self, "marked", lambda start, stop: tuple(plain(part) for part in marked(start, stop)))
 
     @property
+    def format(self) -> str:
+        """The name of its format, for messages."""
+        return self.source.format
+
+    @property
     def is_light(self) -> bool:
         return self.bits is None
 
@@ -77,7 +67,7 @@ class Hints:
     bits: int | None = None
     transfer: str | None = None  # how the light in a picture was coded: linear, srgb, gamma 2.2
     channel: int | None = None  # of a colour cube: 0, 1, 2
-    flip: str = "none"  # lr, ud or both: undoes the orientation of a layout with unknown convention
+    flip: Flip = "none"  # lr, ud or both: undoes the orientation of a layout with unknown convention
     columns: int | None = None  # keep only the first columns (raw Vidar dumps have 416, of which 400 are pixels)
     stretched: bool = False  # codes were stretched to 0 ... 255
     variable: str | None = None  # the array of a .mat file, where it holds several
@@ -108,20 +98,17 @@ def light_recording(
     path: Path,
     shape: tuple[int, int, int],
     marked: Marked,
-    source: str,
-    meta: dict[str, Any],
+    source: Source,
     hints: Hints,
     full: float,
 ) -> Recording:
     """Return a recording of light; `full` is the largest value of the file's pixels, infinite for floats."""
     white, assumed = white_of(path, hints, full)
     if hints.black is not None:
-        marked = _without_black(path, marked, hints.black, meta["transfer"], full)
-        meta = meta | {"black": hints.black}
+        marked = _without_black(path, marked, hints.black, source.transfer, full)
+        source = replace(source, black=hints.black)
     whole = full != float("inf")
-    return Recording(
-        shape, lambda a, b: marked(a, b)[0], source, None, "", meta, marked, white, assumed, full_scale=whole
-    )
+    return Recording(shape, lambda a, b: marked(a, b)[0], source, None, "", marked, white, assumed, full_scale=whole)
 
 
 def _without_black(path: Path, marked: Marked, black: float, transfer: str, full: float) -> Marked:
@@ -149,13 +136,12 @@ def values_recording(
     shape: tuple[int, int, int],
     raw: Callable[[int, int], Array],
     bits: int,
-    source: str,
-    meta: dict[str, Any],
+    source: Source,
     hints: Hints,
 ) -> Recording:
     """Return whole numbers 0 ... 2^bits - 1 [t, H, W] as codes, or with a transfer curve or a white as light."""
     if hints.transfer is None and hints.white is None:
-        return Recording(shape, lambda a, b: checked_codes(path, raw(a, b), bits, a), source, bits, meta=meta)
+        return Recording(shape, lambda a, b: checked_codes(path, raw(a, b), bits, a), source, bits)
     transfer = need_transfer(path, hints)
     full = float(2**bits - 1)
     white, _ = white_of(path, hints, full)
@@ -164,7 +150,7 @@ def values_recording(
         values = checked_codes(path, raw(start, stop), bits, start)
         return to_linear(values, transfer, full), reached(values, white)
 
-    return light_recording(path, shape, marked, source, meta | {"transfer": transfer}, hints, full)
+    return light_recording(path, shape, marked, replace(source, transfer=transfer), hints, full)
 
 
 def white_of(path: Path, hints: Hints, full: float) -> tuple[float | None, bool]:
@@ -195,8 +181,10 @@ def need_transfer(path: Path, hints: Hints) -> str:
 
 
 def with_stated_layout(recording: Recording, bit_order: str, orientation: str) -> Recording:
-    """Return the recording with bit order and orientation in `meta`; statements of its reader are kept."""
-    return replace(recording, meta={"bit_order": bit_order, "orientation": orientation} | recording.meta)
+    """Return the recording with a bit order and an orientation; statements of its reader are kept."""
+    source = recording.source
+    stated = replace(source, bit_order=source.bit_order or bit_order, orientation=source.orientation or orientation)
+    return replace(recording, source=stated)
 
 
 def reoriented(recording: Recording, hints: Hints) -> Recording:
@@ -220,11 +208,11 @@ def reoriented(recording: Recording, hints: Hints) -> Recording:
         light, mask = (block[..., :columns][:, rows, across] for block in recording.marked(start, stop))
         return np.ascontiguousarray(light), np.ascontiguousarray(mask)
 
-    meta = recording.meta | {"flip": hints.flip, "columns_kept": columns}
+    source = replace(recording.source, flip=hints.flip, columns_kept=columns)
     if hints.flip != "none":
-        meta["orientation"] = f"{recording.meta.get('orientation', 'unknown')}; then --flip {hints.flip}"
+        source = replace(source, orientation=f"{source.orientation or 'unknown'}; then --flip {hints.flip}")
     kept = marked if recording.marked is not None else None
-    return replace(recording, shape=(frames, height, columns), read=read, meta=meta, marked=kept)
+    return replace(recording, shape=(frames, height, columns), read=read, source=source, marked=kept)
 
 
 def checked_codes(path: Path, values: Array, bits: int, first: int) -> Array:

@@ -13,6 +13,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import MAX_PIXELS, check_shape
+from qsim.clip.source import Source
 from qsim.files import decoding_errors
 from qsim.formats.images import to_luminance
 from qsim.formats.recording import (
@@ -55,12 +56,12 @@ def read_video(path: Path, hints: Hints) -> Recording:
             light = np.stack([to_luminance(f, transfer, full, f.ndim == 3) for f in found])
             return light, np.stack([reached(f, white, f.ndim == 3) for f in found])
 
-    meta = {"transfer": transfer}
+    source = Source(format="video", transfer=transfer)
     reading = ""
     if about.turn is not None:
-        meta["orientation"] = f"upright: {about.turn.said}"
+        source = replace(source, orientation=f"upright: {about.turn.said}")
         reading = about.turn.said
-    found = light_recording(path, shape, marked, "video", meta, hints, full)
+    found = light_recording(path, shape, marked, source, hints, full)
     return replace(found, reading=reading, times=about.times)
 
 

@@ -19,14 +19,14 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 from scipy import ndimage
 
 from qsim import checks, files
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import ClipInfo
+from qsim.clip.source import Source
 from qsim.clip.writer import ClipWriter
 from qsim.scene.image_files import read_grey
 from qsim.scene.textures import noise, pictures_in
@@ -214,10 +214,10 @@ def read_pictures(paths: Sequence[Path], smallest: int) -> list[Array]:
     return found
 
 
-def write_clip(path: Path, parts: Sequence[Layer], size: tuple[int, int], meta: dict[str, Any]) -> Clip:
-    """Write one clip of `meta["shape"][0]` frames; an interrupted one resumes."""
-    frames = meta["shape"][0]
-    with ClipWriter(path, meta) as writer:
+def write_clip(path: Path, parts: Sequence[Layer], size: tuple[int, int], info: ClipInfo) -> Clip:
+    """Write one clip of `info.shape[0]` frames; an interrupted one resumes."""
+    frames = info.shape[0]
+    with ClipWriter(path, info) as writer:
         for t in range(frames):
             if not writer.has(t):
                 light, flow, valid = frame(parts, size, t - (frames - 1) / 2)
@@ -234,16 +234,16 @@ def make(folder: Path, pictures: Path, licence: Path, args: argparse.Namespace) 
         raise FileNotFoundError(f"{licence}: no such file; name the file that states the licence of the pictures")
     digests = [f"texture {files.sha256(path)}" for path in paths]
     numbers = range(args.first, args.first + args.clips)
-    wanted = {clip_path(folder, n): _described(n, digests, args) for n in numbers}
-    missing = {path: meta for path, meta in wanted.items() if not path.exists()}
-    for path, meta in wanted.items():
-        if path not in missing:
-            _check_same(path, meta)
+    places = {n: clip_path(folder, n) for n in numbers}
+    missing = {n: path for n, path in places.items() if not path.exists()}
+    for n, path in places.items():
+        if n not in missing:
+            _check_same(path, _described(n, digests, args))
     folder.mkdir(parents=True, exist_ok=True)
     _copy_licence(licence, folder)
-    for path, meta in missing.items():
-        rng = np.random.default_rng([args.seed, meta["source"]["number"]])
-        write_clip(path, layers(lights, size, args.motion, rng), size, meta)
+    for n, path in missing.items():
+        rng = np.random.default_rng([args.seed, n])
+        write_clip(path, layers(lights, size, args.motion, rng), size, _described(n, digests, args))
     return len(missing)
 
 
@@ -252,25 +252,23 @@ def clip_path(folder: Path, n: int) -> Path:
     return folder / f"warped_{n:05d}"
 
 
-def _described(n: int, digests: list[str], args: argparse.Namespace) -> dict[str, Any]:
-    """Return clip.json of clip n, without what its writer measures."""
-    return {
-        "shape": [args.frames, args.height, args.width],
-        "frame_rate": 2000.0,
-        "exposure": 1 / 2000.0,
-        "radiance_unit": RELATIVE,
-        "camera": None,
-        "split": args.split,
-        "assets": digests,
-        "source": {"format": "warped pictures", "seed": args.seed, "number": n, "motion": args.motion},
-    }
+def _described(n: int, digests: list[str], args: argparse.Namespace) -> ClipInfo:
+    """Return the description of clip n, without what its writer measures."""
+    return ClipInfo(
+        shape=(args.frames, args.height, args.width),
+        frame_rate=2000.0,
+        exposure=1 / 2000.0,
+        split=args.split,
+        assets=tuple(digests),
+        source=Source(format="warped pictures", seed=args.seed, number=n, motion=args.motion),
+    )
 
 
-def _check_same(path: Path, meta: dict[str, Any]) -> None:
+def _check_same(path: Path, wanted: ClipInfo) -> None:
     """Raise `ValueError` if a clip has another size, other pictures, another seed or motion; its split may differ."""
-    there = Clip.open(path).meta
+    there = Clip.open(path).info
     for key, what in (("shape", "size"), ("assets", "set of pictures"), ("source", "seed or motion")):
-        if there.get(key) != meta[key]:
+        if getattr(there, key) != getattr(wanted, key):
             raise ValueError(f"{path}: was made with another {what}; name another folder, or another --first")
 
 
@@ -310,7 +308,7 @@ def main(words: Sequence[str] | None = None) -> int:
         print(printable(f"warped_pictures: {files.wording(error)}"), file=sys.stderr)
         return 2
     numbers = range(args.first, args.first + args.clips)
-    others = sum(Clip.open(clip_path(args.output, n)).meta.get("split") != args.split for n in numbers)
+    others = sum(Clip.open(clip_path(args.output, n)).info.split != args.split for n in numbers)
     kept = f"; {others} of these keep another split than {args.split}" if others else ""
     print(printable(f"{args.output}: {made} clips made, {args.clips - made} were there{kept}"))
     return 0

@@ -4,43 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import Errors
+from qsim.clip.clip_info import Finding, Work
 
 # Cost of two denoised halves, albedo and normals in samples per pixel, by quality (docs/log.md), best first.
 DENOISE_COST = {"high": 15.0, "balanced": 7.5, "fast": 5.0}
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One effect that a clip models or leaves out, and the size of the remaining error."""
-
-    effect: str
-    chosen: str
-    size: str
-
-
-@dataclass(frozen=True)
-class Budget:
-    """The work for one frame and the reasons for it; clip.json stores the same record."""
-
-    samples: int = 32  # per pixel and frame, all instants and both halves together
-    bounces: int = 6  # scatterings along a path
-    sub_frames: int = 9  # instants per exposure when the shutter is open; their error is measured if 6, 9, 12 ...
-    sharp: bool = True  # also render the instant at mid-exposure when the shutter is open
-    denoise: bool = False  # Open Image Denoise; its error is measured against raw halves
-    left_out: float = 0.0  # W m^-2 sr^-1, rms of later bounces by the pilot; part of the error that a frame states
-    left_out_at_white: float = 0.0  # the same of pictures clamped at white
-    white: float = 0.0  # W m^-2 sr^-1, by the pilot; 0: unknown, each frame uses its own
-    dimmed: float = 0.0  # share of the mean light that later bounces would add, by the pilot
-    dimmed_error: float = 0.0  # standard error of that share
-    findings: tuple[Finding, ...] = field(default=())
-    neighbours: int = 0  # frames on each side whose samples are carried into a frame (reuse/); 0: each frame alone
-    quality: str = "high"  # of the denoiser: high, balanced or fast
+class Budget(Work):
+    """The work for one frame, checked; clip.json stores it."""
 
     def __post_init__(self) -> None:
         for name in ("samples", "bounces", "sub_frames"):

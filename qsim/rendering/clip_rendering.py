@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
-from dataclasses import asdict
-from typing import Any
+from dataclasses import asdict, replace
 
-from qsim import files
-from qsim.clip.manifest import PHYSICAL
+from qsim import files, records
+from qsim.clip.clip_info import PHYSICAL, ClipInfo, FlickerInfo, Matrix, Origin, RenderInfo, SceneName
 from qsim.clip.writer import ClipWriter
 from qsim.rendering.budget import Budget
 from qsim.rendering.engine import free_memory
 from qsim.rendering.renderer import Crop, Renderer
-from qsim.scene import Scene, describe
+from qsim.scene import Scene
 from qsim.streams.clip import Clip
 
 
@@ -29,13 +28,13 @@ def render_clip(
     budget: Budget | None = None,
     crop: Crop | None = None,
     progress: Callable[[int, int], None] | None = None,
-    extra: dict[str, Any] | None = None,
+    made_of: Origin | None = None,
     force: bool = False,
 ) -> Clip:
     """Render frames 0 .. frames - 1 into a clip folder; an equal call with an equal scene resumes an interrupted one.
 
-    `progress(done, frames)` is called after each frame; `extra` is added to clip.json (the split of a
-    data set, for example).
+    `progress(done, frames)` is called after each frame. `made_of` states the job of a data set, the files of the scene;
+    its scene is that of the record unless it names another.
     """
     if frames < 1:
         raise ValueError(f"{path}: a clip needs at least one frame, got {frames}")
@@ -44,30 +43,28 @@ def render_clip(
     )
     free_memory(renderer.engine)  # that of the clip before and of the budget's trials
     y, x, height, width = renderer.crop
-    meta = {
-        "shape": [frames, height, width],
-        "origin": [y, x],
-        "frame_rate": frame_rate,
-        "shutter": shutter,
-        "exposure": (shutter if shutter > 0 else 1.0) / frame_rate,
-        "radiance_unit": PHYSICAL,
-        "camera": describe(scene.camera),
-        "scene": {"family": scene.name, "seed": scene.seed, "speed": scene.speed},
-        "scene_sha256": files.sha256(json.dumps(scene.to_dict(), sort_keys=True).encode()),
-        "seed": seed,
-        "render": asdict(renderer.budget) | {"engine": renderer.engine.backend, "variant": renderer.engine.variant},
-    }
-    if scene.camera.motion is not None:  # camera-to-world matrices at mid-exposure
-        meta["poses"] = [scene.camera.pose(renderer.time(t)).tolist() for t in range(frames)]
-    if scene.flickers:
-        strengths = renderer.strengths(frames)
-        meta["flicker"] = {
-            name: {**asdict(flicker), "kind": type(flicker).__name__, "strength": strengths[name].tolist()}
-            for name, flicker in scene.flickers.items()
-        }
-    if scene.bands is not None:
-        meta["bands"] = list(scene.bands)
-    with ClipWriter(path, meta | (extra or {}), force=force) as writer:
+    made_of = made_of or Origin()
+    if made_of.scene is None:
+        made_of = replace(made_of, scene=SceneName(family=scene.name, seed=scene.seed, speed=scene.speed))
+    times = (renderer.time(t) for t in range(frames)) if scene.camera.motion is not None else ()
+    poses = [scene.camera.pose(t).tolist() for t in times]
+    info = ClipInfo(
+        **vars(made_of),
+        shape=(frames, height, width),
+        origin=(y, x),
+        frame_rate=frame_rate,
+        shutter=shutter,
+        exposure=(shutter if shutter > 0 else 1.0) / frame_rate,
+        radiance_unit=PHYSICAL,
+        camera=scene.camera,
+        poses=records.convert(poses, tuple[Matrix, ...], "poses"),
+        bands=scene.bands,
+        flicker=_flicker_of(scene, renderer, frames),
+        scene_sha256=files.sha256(json.dumps(scene.to_dict(), sort_keys=True).encode()),
+        seed=seed,
+        render=RenderInfo(**vars(renderer.budget), engine=renderer.engine.backend, variant=renderer.engine.variant),
+    )
+    with ClipWriter(path, info, force=force) as writer:
         for t in range(frames):
             if not writer.has(t):
                 frame = renderer.frame(t)
@@ -75,3 +72,14 @@ def render_clip(
             if progress is not None:
                 progress(t + 1, frames)
     return Clip.open(path)
+
+
+def _flicker_of(scene: Scene, renderer: Renderer, frames: int) -> dict[str, FlickerInfo]:
+    """Return the flickering lights of a scene with their strength over each frame."""
+    if not scene.flickers:
+        return {}
+    strengths = renderer.strengths(frames)
+    return {
+        name: FlickerInfo(**asdict(flicker), kind=type(flicker).__name__, strength=tuple(strengths[name].tolist()))
+        for name, flicker in scene.flickers.items()
+    }

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qsim import colour
 from qsim.clip.clamped_error import rms, stated
+from qsim.clip.clip_info import ClipInfo
 from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, MOVING, SLOWEST, moving_mean
 from qsim.colour import bright_end
 from qsim.report import html as page
@@ -67,12 +68,12 @@ def clip_section(clip: Clip) -> page.Section:
         lines.append(flicker_line(clip))
         figures.append(_strengths(clip))
     figures += [code_histogram(clip, clip.stream(name)) for name in clip.streams]
-    lines += error_lines(clip.meta)
-    if clip.meta.get("error_per_frame"):
-        figures.append(error_curve(clip.meta["error_per_frame"]))
+    lines += error_lines(clip.info)
+    if clip.info.error_per_frame:
+        figures.append(error_curve(clip.info.error_per_frame))
     count, height, width = clip.shape
     story = f"{clip.name} has {count} frames of {height} × {width} pixels at {clip.frame_rate:g} frames/s."
-    parts = [*players, page.bullets(lines), modelled(clip.meta), page.grid(figures)]
+    parts = [*players, page.bullets(lines), modelled(clip.info), page.grid(figures)]
     return page.section(f"Clip {clip.name}", *parts, story=story, facts=_facts(clip, frames))
 
 
@@ -95,7 +96,7 @@ def _facts(clip: Clip, frames: range) -> list[page.Fact]:
     facts = [page.Fact(" × ".join(map(str, clip.shape)), f"frames × rows × columns of {clip.name}")]
     if clip.has_truth and (mean := motion(clip, frames)[0]) is not None:
         facts.append(page.Fact(f"{mean:.3g} px", f"per frame: mean motion of what moves{of_first(frames, len(clip))}"))
-    if (found := stated(clip.meta)) is not None:
+    if (found := stated(clip.info)) is not None:
         facts.append(page.Fact(f"{found.psnr:.1f} dB", "PSNR of the rendered light itself"))
     return facts
 
@@ -113,18 +114,18 @@ def light_line(clip: Clip) -> str:
 
 def _stated_times(clip: Clip) -> str:
     """Return the first and last time that the source of an imported clip states, or an empty text."""
-    if clip.times is None:
+    times = clip.info.times
+    if times is None:
         return ""
-    about = clip.meta["times"]
-    return f", taken from {clip.times[0]:.10g} to {clip.times[-1]:.10g} {about['unit']} by the {about['source']}"
+    return f", taken from {times.values[0]:.10g} to {times.values[-1]:.10g} {times.unit} by the {times.source}"
 
 
 def flicker_line(clip: Clip) -> str:
     """Return the lights that flicker, and their strengths in the frames of a clip, as one line."""
     each = []
     for name, found in clip.strengths.items():
-        own = clip.meta["flicker"][name]
-        what = f"{own['kind']}, {own['frequency']:g} Hz"
+        own = clip.info.flicker[name]
+        what = f"{own.kind}, {own.frequency:g} Hz"
         each.append(f"{name} ({what}) {found.min():.3g} to {found.max():.3g} of its mean")
     return f"Flicker, exact means over the exposures: {'; '.join(each)}"
 
@@ -188,28 +189,27 @@ def motion_line(clip: Clip, frames: range) -> str:
     return f"Motion{of_first(frames, len(clip))}: {moving}; 99.9 % of all pixels at most {largest:.3g} px/frame"
 
 
-def error_lines(meta: dict[str, Any]) -> list[str]:
+def error_lines(info: ClipInfo) -> list[str]:
     """Return the stated error of the frames as lines."""
     lines = []
-    errors = meta.get("error_per_frame")
+    errors = info.error_per_frame
     if errors:
         error = rms(np.asarray(errors))
         lines.append(
             f"Error of a frame (noise, blur, omitted bounces): {error:.3g} rms in the unit of the radiance, "
             f"worst {max(errors):.3g}"
         )
-    found = stated(meta)
+    found = stated(info)
     if found is not None:
         lines.append(f"PSNR of the radiance itself: {found.line}")
     return lines
 
 
-def modelled(meta: dict[str, Any]) -> Markup | None:
+def modelled(info: ClipInfo) -> Markup | None:
     """Return a table of the effects that were modelled or omitted, with their sizes; None for clips without it."""
-    findings = meta.get("render", {}).get("findings", [])
-    if not findings:
+    if info.render is None or not info.render.findings:
         return None
-    rows = [[found["effect"], found["chosen"], found["size"]] for found in findings]
+    rows = [[finding.effect, finding.chosen, finding.size] for finding in info.render.findings]
     return page.table(
         page.Table("Effects that were modelled or omitted, and their size", ["effect", "chosen", "size"], rows)
     )

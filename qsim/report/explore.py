@@ -75,6 +75,7 @@ def explore_page(clip: Clip) -> str:
     stored = stored_light(clip)
     frames, height, width = stored.steps.shape
     mean = motion(clip, range(frames))[0] if clip.has_truth else None
+    shutter = clip.info.shutter
     data = {
         "frames": frames,
         "height": height,
@@ -84,7 +85,7 @@ def explore_page(clip: Clip) -> str:
         "steps": _STEPS,
         "exposure": clip.exposure,
         "frameRate": clip.frame_rate,
-        "shutter": float(clip.meta.get("shutter", min(clip.exposure * clip.frame_rate, 1.0))),  # share of a frame
+        "shutter": min(clip.exposure * clip.frame_rate, 1.0) if shutter is None else shutter,  # share of a frame
         "motion": mean,
         "devices": named_sensors(clip.exposure),
     }

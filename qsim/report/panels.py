@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from qsim import colour
 from qsim.clip.clamped_error import Errors, white_in
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.colour import bright_end
 from qsim.report import html as page
 from qsim.sensor.defects import good_pixels
@@ -78,7 +78,7 @@ def toned(light: Photons, white: float) -> NDArray[np.uint8]:
 
 def light_name(clip: Clip) -> str:
     """Return the name of a clip's light: "truth" if rendered; an imported video has the errors of its camera."""
-    return "recorded video" if clip.meta["radiance_unit"] == RELATIVE else "truth"
+    return "recorded video" if clip.info.radiance_unit == RELATIVE else "truth"
 
 
 def truth_stack(clip: Clip, frames: range) -> NDArray[np.float32]:

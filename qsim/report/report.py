@@ -161,14 +161,14 @@ def dataset_sections(path: Path, step: Callable[[], None] = lambda: None) -> lis
         total += frames
         mean, largest = motion(clip, [len(clip) // 2]) if clip.has_truth else (None, None)
         size = f"{frames} × {height} × {width}"
-        found = stated(clip.meta)
+        found = stated(clip.info)
         rows.append(
             [
                 name,
                 split,
                 size,
                 clip.mean_radiance,
-                clip.meta.get("mean_photons"),
+                clip.info.mean_photons,
                 mean,
                 largest,
                 None if found is None else found.psnr,

@@ -88,7 +88,7 @@ def _refuse(path: Path, what: str, **options: int | str | None) -> None:
 def _clip_source(clip: Clip, chosen: str | None) -> Source:
     unit = "relative" if clip.camera is None else "W/m2/sr"
     views = {"sharp": _light_view("sharp", "sharp radiance", unit, len(clip), clip.sharp)}
-    if any(name.startswith("sharp/") for name in clip.meta["checksums"]):
+    if clip.info.has_sharp:
         views["radiance"] = _light_view("radiance", "radiance of the exposure", unit, len(clip), clip.radiance)
     length = len(clip)
     if chosen is not None or clip.streams:

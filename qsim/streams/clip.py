@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, fields, replace
 from qsim import colour as pictures
 from qsim import files
 from qsim.clip.clip_folder import ClipFolder
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.film import Film, card
-from qsim.clip.manifest import RELATIVE
 from qsim.files import Progress
 from qsim.kinds import Text
 from qsim.sensor.sensor import Sensor
@@ -37,7 +37,7 @@ class Clip(ClipFolder):
 
     def __repr__(self) -> str:
         frames, height, width = self.shape
-        unit = "(relative)" if self.meta["radiance_unit"] == RELATIVE else "W/m2/sr"
+        unit = "(relative)" if self.info.radiance_unit == RELATIVE else "W/m2/sr"
         streams = ", ".join(self.streams) or "none"
         unit += "" if self.bands is None else " in each of 3 bands"
         return (
@@ -90,7 +90,7 @@ class Clip(ClipFolder):
         `progress(done, total)` is called after each file; a stream counts as one.
         """
         problems = []
-        stored = sorted(self.meta["checksums"].items())
+        stored = sorted(self.info.checksums.items())
         streams = sorted((self.path / "streams").glob("*.json"))
         report = progress or (lambda done, total: None)
         total = len(stored) + len(streams)

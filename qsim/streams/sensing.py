@@ -36,7 +36,7 @@ from qsim.streams import gates
 from qsim.streams.photons import light_level, light_line
 from qsim.streams.rows import Rows
 from qsim.streams.simulation import Draw, plane_of, same_settings, stored
-from qsim.streams.stream import Stream, orientation, write_packed, writing
+from qsim.streams.stream import Stream, write_packed, writing
 
 
 @dataclass(frozen=True)
@@ -318,7 +318,7 @@ def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
             "ppp_factor": draw.level.factor,
             "mean_photons_before": draw.level.mean_before * draw.planes,
             "equivalent_lux_555nm": draw.level.lux,
-            "radiance_unit": clip.meta["radiance_unit"],
+            "radiance_unit": clip.info.radiance_unit,
             "transfer": "linear",
             "diffraction": draw.diffraction,
             "seed": draw.key.seed,
@@ -437,7 +437,7 @@ def _write(clip: ClipFolder, name: str, blocks: Iterable[Array], sensor: Sensor,
     """Store packed blocks as a stream of the clip; the caller holds the lock of its streams."""
     path = clip.path / "streams" / f"{check_name(name)}.npy"
     scratch.sweep(path.parent)
-    return write_packed(path, blocks, sensor, {"orientation": orientation(clip.meta)} | meta)
+    return write_packed(path, blocks, sensor, {"orientation": clip.info.orientation} | meta)
 
 
 def _tidy(clip: ClipFolder) -> None:

@@ -147,7 +147,7 @@ class Stream:
 
     def known(self) -> Array | None:
         """Return bool [T, H, W], False where light of `truth` is cut off (`Clip.saturated`); None if all is known."""
-        if self.clip.bands is not None or not self.clip.meta.get("saturated_pixels"):  # of colour they are counted only
+        if self.clip.bands is not None or not self.clip.info.saturated_pixels:  # of colour they are counted only
             return None
         return ~np.stack([self._at_mid_exposure(self.clip.saturated, t) for t in range(len(self))])
 

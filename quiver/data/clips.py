@@ -44,7 +44,7 @@ def open_clips(path: Path | str | Iterable[Path | str], split: str | None = None
         raise FileNotFoundError(f"{path}: neither a clip nor a data set (it has no clip.json and no dataset.json)")
     if not made or (path / "dataset.json").exists():
         return Dataset.open(path).clips(split)
-    return [clip for clip in map(Clip.open, made) if split in (None, clip.meta.get("split"))]
+    return [clip for clip in map(Clip.open, made) if split in (None, clip.info.split)]
 
 
 def split_clips(path: Path | str | Iterable[Path | str], validation: str) -> tuple[list[Clip], list[Clip]]:
@@ -60,7 +60,7 @@ def split_clips(path: Path | str | Iterable[Path | str], validation: str) -> tup
 
 def clips_digest(*groups: Sequence[Clip]) -> str:
     """Return the SHA-256 of the names of clips and of the checksums of their files; their folders do not count."""
-    return sha256(to_json([[(clip.name, clip.meta["checksums"]) for clip in group] for group in groups]))
+    return sha256(to_json([[(clip.name, clip.info.checksums) for clip in group] for group in groups]))
 
 
 def unfinished(folders: Iterable[str]) -> list[str]:
@@ -76,7 +76,7 @@ def unfinished(folders: Iterable[str]) -> list[str]:
 
 def has_sharp(clip: Clip) -> bool:
     """Return whether the clip stores sharp frames beside the exposed ones."""
-    return "sharp/000000.exr" in clip.meta["checksums"]
+    return clip.info.has("sharp", 0)
 
 
 def truth(clip: Clip, factor: float, start: int, stop: int) -> Array:
@@ -88,7 +88,7 @@ def truth(clip: Clip, factor: float, start: int, stop: int) -> Array:
 
 def known(clip: Clip, start: int, stop: int) -> Array | None:
     """Return bool [stop - start, H, W], false where a saturated camera cut off the light; None if all are valid."""
-    if clip.bands is not None or not clip.meta.get("saturated_pixels"):  # pixels of colour clips are counted only
+    if clip.bands is not None or not clip.info.saturated_pixels:  # pixels of colour clips are counted only
         return None
     return ~np.stack([clip.saturated(t) for t in range(start, stop)])
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import records
 from qsim.arrays import plain
 from qsim.clip.lazy_array import LazyArray
 from qsim.files import read_json, sha256, to_json, wording
@@ -247,7 +248,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
         frame_rate=clip.frame_rate,
         read=read,
         source=f"{clip.path} seen by {light.sensor} ({light.label}), seed {seed}",
-        digest=lambda: sha256(to_json({"clip_meta": clip.meta} | describe(clip, sensing, draw))),
+        digest=lambda: sha256(to_json({"clip_info": records.plain(clip.info)} | describe(clip, sensing, draw))),
         sensor_name=light.sensor,
         ppp=draw.level.ppp,
         colour=draw.colour,

@@ -11,14 +11,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip import manifest
+from qsim.clip.clip_info import ClipInfo
+from qsim.clip.source import Source
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress, sha256, to_json
 from qsim.formats.detection import recordings
@@ -55,7 +56,7 @@ TEST_SETS = {
 }
 
 
-def describe(folder: Path, which: TestSet) -> dict[Path, dict[str, Any]]:
+def describe(folder: Path, which: TestSet) -> dict[Path, ClipInfo]:
     """Read a test set, and return what the clip of each recording states of itself.
 
     `FileNotFoundError` without the folder. `ValueError` if it holds no recordings, both kinds of them, two that would
@@ -77,7 +78,7 @@ def import_test_set(
     which: TestSet,
     out: Path,
     progress: Progress | None = None,
-    described: Mapping[Path, dict[str, Any]] | None = None,
+    described: Mapping[Path, ClipInfo] | None = None,
 ) -> list[Clip]:
     """Write the clips of a test set that OUT does not hold yet, and return all of them in the order of their names.
 
@@ -87,13 +88,13 @@ def import_test_set(
     described = describe(folder, which) if described is None else described
     targets = {file: out / _name(folder, file) for file in described}
     _check_others(folder, out, {target.name for target in targets.values()})
-    for file, meta in described.items():
-        _check_target(targets[file], meta)
+    for file, info in described.items():
+        _check_target(targets[file], info)
     clips = []
-    for done, (file, meta) in enumerate(described.items()):
+    for done, (file, info) in enumerate(described.items()):
         if progress is not None:
             progress(done, len(described))
-        clips.append(_imported(file, targets[file], meta))
+        clips.append(_imported(file, targets[file], info))
     if progress is not None:
         progress(len(described), len(described))
     return clips
@@ -122,7 +123,7 @@ def _check_names(folder: Path, files: list[Path]) -> None:
             raise ValueError(f"{folder}: {other} and {file} would both be clip {_name(folder, file)}; rename one")
 
 
-def _described(file: Path, which: TestSet) -> dict[str, Any]:
+def _described(file: Path, which: TestSet) -> ClipInfo:
     """Return what a clip of a recording states of itself; `ValueError` for one of fewer than eleven frames."""
     frames = read_frames(file) if file.is_file() else read_pictures(file)
     first = next(frames, None)
@@ -132,20 +133,14 @@ def _described(file: Path, which: TestSet) -> dict[str, Any]:
     count = sum(1 for _ in frames) + 1
     if count < WINDOW:
         raise ValueError(f"{file}: {count} frames; a published window has {WINDOW}")
-    return {
-        "shape": [count, *size],
-        "frame_rate": which.frame_rate,
-        "exposure": 1 / which.frame_rate,
-        "radiance_unit": manifest.RELATIVE,
-        "camera": None,
-        "source": {
-            "file": str(file.resolve()),
-            "sha256": _digest(file),
-            "test_set": which.name,
-            "size": list(first.shape[:2]),
-        },
-        "split": "test",
-    }
+    height, width = first.shape[:2]
+    return ClipInfo(
+        shape=(count, *size),
+        frame_rate=which.frame_rate,
+        exposure=1 / which.frame_rate,
+        source=Source(file=str(file.resolve()), sha256=_digest(file), test_set=which.name, size=(height, width)),
+        split="test",
+    )
 
 
 def _digest(file: Path) -> str:
@@ -163,30 +158,30 @@ def _check_others(folder: Path, out: Path, names: set[str]) -> None:
             raise ValueError(f"{item}: is no clip of {folder}; choose another -o")
 
 
-def _check_target(target: Path, meta: dict[str, Any]) -> None:
+def _check_target(target: Path, info: ClipInfo) -> None:
     """Raise `ValueError` if the folder of a clip holds another one."""
     if not target.exists():
         return
     clip = Clip.open(target)
-    wanted = dict(meta["source"])
-    found = clip.meta.get("source") or {}
-    same = list(clip.shape) == meta["shape"]
+    wanted = info.source or Source()
+    found = clip.info.source or Source()
+    same = clip.shape == info.shape
     if found == wanted and same:
         return
-    if found | {"sha256": wanted.get("sha256")} == wanted and same:
-        raise ValueError(f"{target}: {wanted['file']} was changed since it became this clip; choose another -o")
+    if replace(found, sha256=wanted.sha256) == wanted and same:
+        raise ValueError(f"{target}: {wanted.file} was changed since it became this clip; choose another -o")
     raise ValueError(
-        f"{target}: is a clip of {found.get('file')} with {len(clip)} frames, not of {wanted['file']} with "
-        f"{meta['shape'][0]}; choose another -o"
+        f"{target}: is a clip of {found.file or 'another source'} with {len(clip)} frames, not of {wanted.file} with "
+        f"{info.shape[0]}; choose another -o"
     )
 
 
-def _imported(file: Path, target: Path, meta: dict[str, Any]) -> Clip:
+def _imported(file: Path, target: Path, info: ClipInfo) -> Clip:
     """Return the clip of a recording, written now unless it is there."""
     if target.exists():
         return Clip.open(target)
-    size = tuple(meta["shape"][1:])
-    with ClipWriter(target, meta) as writer:
+    size = info.shape[1:]
+    with ClipWriter(target, info) as writer:
         for t, frame in enumerate(read_frames(file) if file.is_file() else read_pictures(file)):
             if not writer.has(t):
                 writer.add(t, resized(grey(frame), size).astype(np.float32) / np.float32(255))

@@ -293,7 +293,7 @@ def windows(
         raise ValueError("split= is for the folder of a data set; leave it out")
     elif isinstance(source, Stream):
         folder = source.clip
-        clips = [Clip(folder.path, folder.meta, folder.keeps)]
+        clips = [Clip(folder.path, folder.info, folder.keeps)]
         settings = replace(settings, lights=(Noise.of_stream(source),))
     else:
         clips = [source] if isinstance(source, Clip) else source

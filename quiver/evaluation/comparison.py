@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import records
 from qsim.files import read_json, write_json
 from quiver import threads
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
@@ -75,8 +76,8 @@ def scored_frames(length: int, published: bool) -> range:
 
 def scene_of(clip: Clip) -> str:
     """Return family and seed: clips of one scene are not independent evidence."""
-    scene = clip.meta.get("scene") or {}
-    return f"{scene['family']}:{scene.get('seed', 0)}" if "family" in scene else clip.name
+    scene = clip.info.scene
+    return clip.name if scene is None else f"{scene.family}:{scene.seed}"
 
 
 def clips_of(comparison: Comparison) -> list[Clip]:
@@ -90,14 +91,14 @@ def truth_psnr(clip: Clip, factor: float, peak: float, frames: range) -> float |
     """Return the PSNR [dB] of the clip's own truth at a peak in photons, from its measured errors; None without them.
 
     It is a lower bound. Errors that were measured clamped at white apply to peaks up to 2.5 times the mean light. At
-    another peak, and for clips of earlier versions, an unclamped error counts as if all of it lay below the peak.
+    another peak an unclamped error counts as if all of it lay below the peak.
     Errors are measured in radiance, to which photons are proportional.
     """
-    errors = clip.meta.get("error_per_frame")
+    errors = clip.info.error_per_frame
     if not errors or clip.mean_radiance <= 0:
         return None
     if peak <= peak_of(mean_light(clip, factor), None) * (1 + 1e-6):
-        errors = clip.meta.get("error_at_white_per_frame", errors)
+        errors = clip.info.error_at_white_per_frame or errors
     unit = mean_light(clip, factor) / clip.mean_radiance / peak
     return metrics.truth_psnr([errors[t] * unit for t in frames])
 
@@ -280,9 +281,8 @@ def in_memory(codes: Codes) -> Codes:
 
 def content_of(comparison: Comparison, clips: Sequence[Clip]) -> dict[str, Any]:
     """Return the SHA-256 of the scored content: the descriptions of clips and stored stream, and the sensor files."""
-    described = [
-        [clip.meta, None if comparison.stream is None else clip.stream(comparison.stream).meta] for clip in clips
-    ]
+    name = comparison.stream
+    described = [[records.plain(clip.info), None if name is None else clip.stream(name).meta] for clip in clips]
     found = {"content_sha256": hashlib.sha256(json.dumps(described, sort_keys=True, default=str).encode()).hexdigest()}
     files = file_digests(comparison.lights)
     return found | ({"sensors_sha256": files} if files else {})

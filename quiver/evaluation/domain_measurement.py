@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from qsim.files import VERSION, Progress
+from qsim import records
+from qsim.files import VERSION, Progress, to_json
 from qsim.locks import Lock
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import sensed
@@ -61,7 +61,7 @@ class DomainSettings:
 
 def clips_digest(clips: Sequence[Clip]) -> str:
     """Return the SHA-256 of the descriptions of the clips, which include the checksums of their files."""
-    return hashlib.sha256(json.dumps([clip.meta for clip in clips], sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(to_json([records.plain(clip.info) for clip in clips])).hexdigest()
 
 
 def clips_of(sources: Sequence[Path], split: str | None) -> tuple[Clip, ...]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.manifest import PHYSICAL, RELATIVE
+from qsim.clip.clip_info import PHYSICAL, RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.dataset.generation import Options, generate
 from qsim.dataset.job import Job, Settings

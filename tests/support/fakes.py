@@ -14,7 +14,8 @@ from unittest import mock
 
 import numpy as np
 
-from qsim.clip.manifest import PHYSICAL
+from qsim import records
+from qsim.clip.clip_info import PHYSICAL
 from qsim.clip.writer import ClipWriter
 from qsim.dataset import recipe
 from qsim.dataset.dataset import Dataset
@@ -22,7 +23,6 @@ from qsim.dataset.generation import Options
 from qsim.dataset.job import Job
 from qsim.dataset.provenance import origin
 from qsim.optics.camera import Camera
-from qsim.scene import describe
 from qsim.streams.clip import Clip
 
 RECIPE = """[recipe]
@@ -63,9 +63,9 @@ def make(job: Job, path: Path) -> Clip:
         "shutter": settings.shutter,
         "exposure": 1 / settings.frame_rate,
         "radiance_unit": PHYSICAL,
-        "camera": describe(camera),
+        "camera": records.plain(camera),
     }
-    with ClipWriter(path, meta | origin(job)) as writer:
+    with ClipWriter(path, meta | records.plain(origin(job))) as writer:
         for t in range(settings.frames):
             if not writer.has(t):
                 rng = np.random.default_rng([job.scene_seed, len(job.family), t])

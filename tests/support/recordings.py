@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.formats import importing
 from qsim.formats.importing import Import

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from qsim.clip.manifest import PHYSICAL
+from qsim.clip.clip_info import PHYSICAL
 from qsim.clip.writer import ClipWriter
 from qsim.streams.clip import Clip
 
@@ -13,7 +13,6 @@ FRAMES = 5
 HEIGHT = 10
 WIDTH = 7
 CAMERA = {
-    "kind": "Camera",
     "focal_length": 8e-3,
     "f_number": 2.8,
     "pixel_pitch": 1.1e-6,

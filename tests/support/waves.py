@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.streams.clip import Clip
 

@@ -27,7 +27,7 @@ from qsim import files
 from qsim.calibration import sensor_file
 from qsim.cli.program import main
 from qsim.clip import exr
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.dataset import checking, recipe
 from qsim.formats import array_files, detection, images, importing, video

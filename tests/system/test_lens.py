@@ -56,5 +56,5 @@ def test_the_recipe_goes_from_rendering_to_the_report_and_its_path_to_another_sc
     (tmp_path / "along.toml").write_text(other)
     assert qsim.cli.program.main(["generate", str(tmp_path / "along.toml"), "-o", str(tmp_path / "along")]) == 0
     along = Clip.open(tmp_path / "along" / "clips" / "text_0001_x8")
-    np.testing.assert_allclose(along.meta["poses"][0], clip.meta["poses"][0], atol=1e-9)
+    np.testing.assert_allclose(along.info.poses[0], clip.info.poses[0], atol=1e-9)
     assert along.camera.lens == Lens(camera.lens.k1, camera.lens.k2)

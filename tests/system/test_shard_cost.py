@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from stats import critical_z
 
+from qsim import records
 from qsim.cli.program import main as qsim
-from qsim.clip.manifest import PHYSICAL
+from qsim.clip.clip_info import PHYSICAL
 from qsim.clip.writer import ClipWriter
 from qsim.dataset import cost_forecast, recipe
 from qsim.dataset.cost_forecast import Cost, Seconds
@@ -19,7 +20,6 @@ from qsim.dataset.generation import Options, generate
 from qsim.dataset.job import Job
 from qsim.dataset.provenance import origin
 from qsim.optics.camera import Camera
-from qsim.scene import describe
 from qsim.streams.clip import Clip
 
 ROOT = Path(__file__).parents[2]
@@ -52,12 +52,12 @@ def make(job: Job, path: Path) -> Clip:
     frames = job.settings.frames
     height = job.settings.height
     width = job.settings.width
-    camera = describe(Camera(8e-3, 2.8, 1.1e-6, height, width))
+    camera = records.plain(Camera(8e-3, 2.8, 1.1e-6, height, width))
     meta = {"shape": [frames, height, width], "frame_rate": 2000.0, "shutter": 0.0, "exposure": 5e-4}
     meta |= {"radiance_unit": PHYSICAL, "camera": camera, "render": {"samples": 8, "neighbours": 3}}
     flow = np.zeros((2, height, width))
     flow[0, :, : width // 2] = 2
-    with ClipWriter(path, meta | origin(job)) as writer:
+    with ClipWriter(path, meta | records.plain(origin(job))) as writer:
         for t in range(frames):
             writer.add(t, np.tile([1.0, 3.0], (height, width // 2)), truth={"flow": flow}, error=1e-3)
     return Clip.open(path)

@@ -35,7 +35,7 @@ def test_the_recipe_goes_from_rendering_to_the_report(tmp_path):
     assert run("generate", tmp_path / "skinned.toml", "-o", folder, "--shard", "1/2") == 0
     assert run("generate", tmp_path / "skinned.toml", "-o", folder) == 0
     clip, arms = (Clip.open(folder / "clips" / name) for name in ("walker_0001_x8", "arm_0000_x100"))
-    assert arms.meta["reads"].keys() == {"arm.glb"}
+    assert arms.info.reads.keys() == {"arm.glb"}
     for each in (clip, arms):
         assert np.hypot(*each.flow(4))[each.body_id(4) == 2].max() > 0.2
     alone = tmp_path / "alone"

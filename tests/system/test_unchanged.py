@@ -291,7 +291,7 @@ def _rendered(path: Path, line: str) -> Results:
 
 
 def _light(clip: Clip, line: str) -> Results:
-    budget = {key: clip.meta["render"][key] for key in ("samples", "bounces", "denoise")}
+    budget = {key: getattr(clip.info.render, key) for key in ("samples", "bounces", "denoise")}
     for t in range(len(clip)):
         cut = slice(None, None, -(-clip.shape[1] // 32)), slice(None, None, -(-clip.shape[2] // 32))
         yield f"{line}, radiance {t}", Rendered(clip.radiance(t)[cut], **budget)
@@ -304,7 +304,7 @@ def _light(clip: Clip, line: str) -> Results:
             yield f"{line}, valid", checksum(clip.valid(t))
     means = np.array([clip.mean_radiance, clip.mean_photons])
     yield f"{line}, means", Sums(means, budget["samples"] * budget["bounces"], np.float32, of="each")
-    errors = np.array([*clip.meta["error_per_frame"], clip.meta["psnr_of_truth"]])
+    errors = np.array([*clip.info.error_per_frame, clip.info.psnr_of_truth])
     yield f"{line}, errors", ErrorsOfLight(errors, Rendered(clip.radiance(0), **budget))
     yield f"{line}, budget", json.dumps(list(budget.values()))
 
@@ -565,7 +565,7 @@ def tables_of_bit_depths(folder: Path) -> Results:
 def software() -> dict[str, str]:
     """Versions that rendered light depends on."""
     with tempfile.TemporaryDirectory() as folder:
-        about = Clip.open(write_clip(Path(folder) / "clip", 1, 4, 4)).meta["software"]
+        about = Clip.open(write_clip(Path(folder) / "clip", 1, 4, 4)).info.software
     doctor = run(qsim.cli.main, "doctor")
     engine = f"{doctor['reason'].split(',')[0]}, {'with' if doctor['extras']['denoise'] else 'without'} denoiser"
     return {key: about[key] for key in ("numpy", "mitsuba", "drjit")} | {"engine": engine}

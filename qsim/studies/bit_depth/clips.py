@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from qsim import keys
+from qsim.clip.clip_info import ClipInfo, Grouped, Origin, SceneName
 from qsim.clip.manifest import target_of
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
@@ -55,11 +56,11 @@ def render(name: str, path: Path, shape: ClipShape, *, speed: float = 1.0, progr
     scene = loaded.resized(shape.height, shape.width)
     if (path / "clip.json").is_file():
         clip = Clip.open(path)
-        wanted = {"family": scene.name, "seed": scene.seed, "speed": scene.speed}
+        wanted = SceneName(family=scene.name, seed=scene.seed, speed=scene.speed)
         same = clip.shape == (shape.frames, shape.height, shape.width) and clip.frame_rate == shape.frame_rate
-        if not same or clip.meta.get("scene") != wanted:
+        if not same or clip.info.scene != wanted:
             raise FileExistsError(f"{path}: exists and is another clip; name another folder with -o")
-        if clip.meta.get("reads", {}) != read:
+        if clip.info.reads != read:
             raise FileExistsError(
                 f"{path}: exists and is not known to be of {name} and its files as they are now; name another folder "
                 "with -o"
@@ -68,9 +69,9 @@ def render(name: str, path: Path, shape: ClipShape, *, speed: float = 1.0, progr
     frames = shape.frames
     rate = shape.frame_rate
     chosen = fidelity.choose_budget(scene, frame_rate=rate, frames=frames, psnr=shape.psnr, seed=shape.seed)
-    extra = {"reads": read} if read else None
+    made_of = Origin(reads=read)
     return render_clip(
-        scene, path, frames=frames, frame_rate=rate, seed=shape.seed, budget=chosen, progress=progress, extra=extra
+        scene, path, frames=frames, frame_rate=rate, seed=shape.seed, budget=chosen, progress=progress, made_of=made_of
     )
 
 
@@ -181,18 +182,25 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings, *, force: b
 
 def group(clip: Clip, path: Path, m: int, *, force: bool = False) -> Clip:
     """Write a clip whose frames are means of m frames (m odd) and whose sharp frames are the middle ones."""
+    # The pose of a mean is that of its middle frame.
     kept = ("radiance_unit", "camera", "scene", "split", "origin", "seed", "render")
-    meta = {key: clip.meta[key] for key in kept if key in clip.meta}
     frames, height, width = clip.shape
-    meta |= {"shape": [frames // m, height, width], "frame_rate": clip.frame_rate / m, "exposure": clip.exposure * m}
-    meta |= {"shutter": 1.0, "grouped": {"from": clip.name, "frames": m}}
-    with ClipWriter(path, meta, force=force) as writer:
+    info = ClipInfo(
+        **{name: getattr(clip.info, name) for name in kept},
+        shape=(frames // m, height, width),
+        frame_rate=clip.frame_rate / m,
+        exposure=clip.exposure * m,
+        shutter=1.0,
+        poses=clip.info.poses[m // 2 :: m][: frames // m],
+        grouped=Grouped(clip=clip.name, frames=m),
+    )
+    with ClipWriter(path, info, force=force) as writer:
         for t in range(frames // m):
             mean = np.stack([clip.radiance(t * m + i) for i in range(m)]).mean(axis=0, dtype=np.float64)
             cut = None
-            if clip.meta.get("saturated_pixels"):
+            if clip.info.saturated_pixels:
                 cut = np.any([clip.saturated(t * m + i) for i in range(m)], axis=0)
             middle = t * m + m // 2
-            sharp = clip.sharp(middle) if m > 1 or f"sharp/{middle:06d}.exr" in clip.meta["checksums"] else None
+            sharp = clip.sharp(middle) if m > 1 or clip.info.has("sharp", middle) else None
             writer.add(t, np.asarray(mean, np.float32), sharp, saturated=cut)
     return Clip.open(path)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import ClipInfo
 from qsim.clip.writer import ClipWriter
 from qsim.formats import exporting
 from qsim.streams.clip import Clip
@@ -98,8 +98,8 @@ def textured_clip(path: Path, seed: int) -> Clip:
     """Write a clip of a texture that moves by 3 px per frame, with some noise: video can compress it, with a loss."""
     rng = np.random.default_rng(seed)
     texture = np.kron(rng.random((HEIGHT // 4, WIDTH // 4)), np.ones((4, 4)))
-    meta = {"shape": [FRAMES, HEIGHT, WIDTH], "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE}
-    with ClipWriter(path, meta | {"camera": None}) as writer:
+    info = ClipInfo(shape=(FRAMES, HEIGHT, WIDTH), frame_rate=2000.0, exposure=5e-4)
+    with ClipWriter(path, info) as writer:
         for t in range(FRAMES):
             writer.add(t, np.roll(texture, 3 * t, axis=1) + 0.02 * rng.random((HEIGHT, WIDTH)))
     return Clip.open(path)

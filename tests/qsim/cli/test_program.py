@@ -19,7 +19,7 @@ import pytest
 from qsim import files
 from qsim.cli import dataset
 from qsim.cli.program import main
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset
@@ -266,7 +266,7 @@ def test_check_shows_how_far_it_is(made: Path, capsys: pytest.CaptureFixture[str
     monkeypatch.setattr(dataset, "bar", recorded)
     clip = Dataset.open(made).clips()[0]
     assert run(capsys, "check", made, clip.path)[0] == 0
-    files = len(clip.meta["checksums"]) + len(clip.streams)
+    files = len(clip.info.checksums) + len(clip.streams)
     assert files > 4
     assert shown == [
         (str(made), "clip", [(n, 3) for n in (1, 2, 3)]),

@@ -20,6 +20,7 @@ from qsim.clip.clamped_error import (
     white_in,
     white_of,
 )
+from qsim.clip.clip_info import ClipInfo, ErrorInfo
 from qsim.optics.radiometry import WHITE_PER_MEAN
 
 SIZE = 200  # px, sides of the noise images
@@ -81,24 +82,29 @@ def test_an_error_is_interpolated_at_any_white(seed):
     assert error_at(forecast, pairs) == pytest.approx(Errors.of_halves(halves, forecast).at_white)
 
 
+def described(mean: float, found: ErrorInfo) -> ClipInfo:
+    """A clip of a mean radiance with the errors of its frames."""
+    return ClipInfo(shape=(2, 8, 8), frame_rate=2000.0, exposure=5e-4, mean_radiance=mean, **vars(found))
+
+
 def test_a_clip_states_both_figures_below_its_own_white():
     pairs = [[[1.0, 0.01], [4.0, 0.04]], [[1.0, 0.02], [4.0, 0.04]]]
     found = measured(means=[0.4, 0.4], high=5.0, errors=[0.1, 0.1], errors_at=pairs)
-    assert found["white"] == pytest.approx(1.0)
-    assert found["error_at_white_per_frame"] == pytest.approx([math.hypot(0.01, 0.02) / math.sqrt(2)] * 2)
-    assert found["psnr_of_truth"] == pytest.approx(-10 * math.log10((0.01**2 + 0.02**2) / 2))
-    assert found["psnr_unclamped"] == pytest.approx(20.0)
-    line = stated(found | {"mean_radiance": 0.4}).line
+    assert found.white == pytest.approx(1.0)
+    assert found.error_at_white_per_frame == pytest.approx([math.hypot(0.01, 0.02) / math.sqrt(2)] * 2)
+    assert found.psnr_of_truth == pytest.approx(-10 * math.log10((0.01**2 + 0.02**2) / 2))
+    assert found.psnr_unclamped == pytest.approx(20.0)
+    line = stated(described(0.4, found)).line
     assert line == "36.0 dB below white (2.5 x the mean), clamped there; 20.0 dB unclamped"
     plain = measured([0.4, 0.4], 5.0, [0.1, 0.1], [[], []])  # without clamped errors: the plain error is never smaller
-    assert plain["psnr_of_truth"] == plain["psnr_unclamped"]
-    assert "psnr_of_truth" not in measured([0.0], 0.0, [0.1], [[]])
+    assert plain.psnr_of_truth == plain.psnr_unclamped
+    assert measured([0.0], 0.0, [0.1], [[]]).psnr_of_truth is None
 
 
 def test_a_white_above_those_of_the_frames_takes_the_plain_error():
     found = measured([4.0, 4.0], 100.0, [1.0, 1.0], [[[1.0, 0.01], [2.0, 0.02]]] * 2)
-    assert found["white"] == pytest.approx(10.0)
-    assert found["psnr_of_truth"] == found["psnr_unclamped"] == pytest.approx(20.0)
+    assert found.white == pytest.approx(10.0)
+    assert found.psnr_of_truth == found.psnr_unclamped == pytest.approx(20.0)
 
 
 def test_a_frame_states_the_mean_of_three_estimates():

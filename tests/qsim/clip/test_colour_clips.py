@@ -10,6 +10,7 @@ from clips import colour_clip, write_clip
 from PIL import Image
 
 from qsim.cli import main
+from qsim.clip.clip_info import ClipInfo
 from qsim.clip.writer import ClipWriter
 from qsim.colour import from_linear
 from qsim.optics.diffraction import diffract
@@ -37,7 +38,7 @@ def test_bands_are_stored_as_halves_in_one_file(tmp_path):
 
 def test_photons_of_a_band_have_its_wavelength(tmp_path):
     clip = colour_clip(tmp_path / "c", origin=[2, 3])
-    clip = replace(clip, meta=clip.meta | {"camera": clip.meta["camera"] | {"height": 20, "width": 30}})
+    clip = replace(clip, info=replace(clip.info, camera=replace(clip.camera, height=20, width=30)))
     camera = clip.camera
     found = clip_photons(clip, 1, 2.0)
     area = camera.fill_factor * camera.pixel_pitch**2
@@ -95,10 +96,9 @@ def test_what_takes_one_band_says_so(tmp_path):
         pytest.raises(ValueError, match=r"radiance of frame 0 is \(7, 9\), expected \(3, 7, 9\)"),
         ClipWriter(
             tmp_path / "d",
-            {k: v for k, v in clip.meta.items() if k in ("shape", "frame_rate", "exposure")}
-            | {"radiance_unit": "relative", "bands": list(RGB)},
+            ClipInfo(shape=clip.shape, frame_rate=clip.frame_rate, exposure=clip.exposure, bands=RGB),
         ) as writer,
     ):
         writer.add(0, np.ones((7, 9), np.float32))
-    with pytest.raises(ValueError, match="bands must be three wavelengths in m"):
+    with pytest.raises(ValueError, match="bands: expected a list of 3"):
         write_clip(tmp_path / "e", bands=[1.0, 2.0])

@@ -16,7 +16,7 @@ def test_the_largest_half_is_kept_and_counted(tmp_path: Path):
     with ClipWriter(tmp_path / "a", meta(shape=[1, 2, 3])) as writer:
         writer.add(0, np.array([[1e6, 65504, 1], [0, 1e-7, 70000]], np.float32))
     clip = Clip.open(tmp_path / "a")
-    assert clip.meta["clipped_pixels"] == 2
+    assert clip.info.clipped_pixels == 2
     assert clip.radiance(0).max() == 65504
 
 
@@ -32,7 +32,7 @@ def test_light_above_the_largest_half_is_a_lower_bound(tmp_path: Path):
     found = np.stack([clip.saturated(t) for t in range(3)])
     np.testing.assert_array_equal(found[:2], np.stack([(sun > 1) | (glint > 1), glint > 1]))
     assert not found[2].any()
-    assert clip.meta["saturated_pixels"] == clip.meta["clipped_pixels"] == 3
+    assert clip.info.saturated_pixels == clip.info.clipped_pixels == 3
     assert not (clip.path / "saturated" / "000002.exr").exists()
     assert clip.verify() == []
     np.testing.assert_array_equal(clip.sense("quiver-physical", ppp=3.0).known(), ~found)
@@ -41,8 +41,8 @@ def test_light_above_the_largest_half_is_a_lower_bound(tmp_path: Path):
 def test_colour_clips_count_such_pixels_only(tmp_path: Path):
     """Scores of colours know no marks of pixels, so none are stored."""
     clip = write_clip(tmp_path / "a", radiance=np.full((2, 3, 4, 5), 1e5), bands=list(RGB))
-    assert clip.meta["clipped_pixels"] == 40
-    assert "saturated_pixels" not in clip.meta
+    assert clip.info.clipped_pixels == 40
+    assert clip.info.saturated_pixels is None
     assert not clip.saturated(0).any()
 
 

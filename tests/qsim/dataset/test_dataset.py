@@ -17,6 +17,9 @@ from qsim.dataset.checking import check
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import generate
 
+ONE = "1f" * 32
+TWO = "2f" * 32
+
 
 def test_a_finished_data_set(tmp_path: Path):
     generate(SMALL, tmp_path / "d", HERE, make=make)
@@ -29,7 +32,7 @@ def test_a_finished_data_set(tmp_path: Path):
     assert found.recipe["recipe"]["frames"] == 3
     clip = found.clips()[1]
     assert clip.streams == ("quiver-physical_1bit_3.25ppp", "quiver-physical_3bit_3.25ppp")
-    assert clip.meta["split"] == "train"
+    assert clip.info.split == "train"
     assert clip.stream(clip.streams[1]).codes().shape == (3, 8, 10)
     with pytest.raises(ValueError, match="unknown split 'tset'"):
         found.clips("tset")
@@ -98,10 +101,16 @@ def test_files_that_scenes_of_both_kinds_read_are_reported_by_name(tmp_path: Pat
     generate(SMALL, folder, HERE, make=make)
     for name, mesh, picture in [("fan_0001", "bunny.obj", "a.png"), ("tumble_0004", "/mine/HARE.OBJ", "b.png")]:
         path = folder / "clips" / name / "clip.json"
-        reads = {mesh: "1f", picture: "2f", "*.obj": "3f", "LICENCE.txt": "4f", f"{name}.hdr": name}
-        files.write_description(path, files.read_json(path) | {"assets": ["photograph 2f"], "reads": reads})
+        reads = {
+            mesh: ONE,
+            picture: TWO,
+            "*.obj": "3" * 64,
+            "LICENCE.txt": "4" * 64,
+            f"{name}.hdr": files.sha256(name.encode()),
+        }
+        files.write_description(path, files.read_json(path) | {"assets": [f"photograph {TWO}"], "reads": reads})
     shared = generate(SMALL, folder, HERE, make=make).shared
     clip = folder / "clips" / "tumble_0004"
-    named = ("b.png (SHA-256 2f)", "/mine/HARE.OBJ (SHA-256 1f)")
+    named = (f"b.png (SHA-256 {TWO})", f"/mine/HARE.OBJ (SHA-256 {ONE})")
     assert shared == tuple(f"{clip}: its file {each} is also in fan_0001, which is not a test clip" for each in named)
     assert set(shared) <= set(Dataset.open(folder).verify())

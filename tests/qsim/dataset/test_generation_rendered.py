@@ -44,8 +44,8 @@ def test_a_killed_generation_resumes_to_the_same_bytes(tmp_path: Path):
     assert found.verify() == []
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
     for clip in found.clips():
-        assert clip.meta["psnr_of_truth"] > 24
-        assert [asset for asset in clip.meta["assets"] if asset.startswith("mesh ")]
+        assert clip.info.psnr_of_truth > 24
+        assert [asset for asset in clip.info.assets if asset.startswith("mesh ")]
         for name in clip.streams:
             stream = clip.stream(name)
             assert stream.meta["ppp_target"] * 0.5 < stream.codes().mean() / stream.meta["sensor"]["gain"] / 0.8 * 2

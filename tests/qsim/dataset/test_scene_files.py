@@ -83,7 +83,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def make(job: Job, path: Path) -> object:
     """Make a clip that lists the files of its scene, as a rendered one does."""
     _, read = job_runner.load_traced(job)
-    return write_clip(path, frames=1, height=2, width=3, seed=job.scene_seed, **provenance.origin(job, read))
+    return write_clip(path, frames=1, height=2, width=3, **vars(provenance.origin(job, read)))
 
 
 def test_a_python_scene_names_all_that_it_declares_and_imports_every_time(place: Path):

@@ -26,8 +26,8 @@ def test_a_family_its_record_and_its_file_give_the_same_clip(tmp_path: Path):
     clips = [render(source, **QUICK, seed=3) for source in ("fan", file, scenes.load("fan", 3))]
     for clip in clips[1:]:
         np.testing.assert_array_equal(clip[:], clips[0][:])
-        assert clip.meta["checksums"] == clips[0].meta["checksums"]
-    assert list(clips[1].meta["reads"]) == ["own.py"]
+        assert clip.info.checksums == clips[0].info.checksums
+    assert list(clips[1].info.reads) == ["own.py"]
     stored = render("fan", tmp_path / "fan", **QUICK, seed=3)
     assert stored.path == tmp_path / "fan"
     np.testing.assert_array_equal(stored.sense(ppp=3.25).codes, clips[0].sense(ppp=3.25).codes)
@@ -59,7 +59,7 @@ def test_a_camera_path_replaces_the_camera_of_a_scene(tmp_path: Path):
     file = tmp_path / "transforms.json"
     write_camera_path(file, camera, frames=5, frame_rate=1000.0)
     clip = render("fan", **QUICK, camera_path=file)
-    for t, pose in enumerate(clip.meta["poses"]):
+    for t, pose in enumerate(clip.info.poses):
         np.testing.assert_allclose(pose, camera.pose(t / 2000.0), atol=1e-4)  # between two poses of the file
     assert clip.camera.lens == Lens(-0.05)
     assert clip.camera.focal_pixels == pytest.approx(camera.focal_pixels)

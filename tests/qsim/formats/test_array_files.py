@@ -123,7 +123,7 @@ def test_zarr_of_both_versions(tmp_path: Path, version: int, root: bool):
     recording = importing.read(Path(path))
     np.testing.assert_array_equal(recording.read(0, 11), expected)
     if not root:
-        assert recording.meta["attributes"]["fps"] == 1000
+        assert recording.source.attributes["fps"] == 1000
 
 
 def test_zarr_without_frames_or_with_missing_chunks(tmp_path: Path):

@@ -117,7 +117,7 @@ def test_a_folder_of_videos_becomes_clips(tmp_path: Path):
     options = ["--frame-rate", "2000", "--transfer", "gamma 2.2", "--split", "test"]
     assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), *options]) == 0
     found = Clip.open(tmp_path / "out" / "occ_a")
-    assert found.meta["split"] == "test"
+    assert found.info.split == "test"
     assert found.camera is None
     np.testing.assert_allclose(found.radiance(1), clip.radiance(1), atol=0.012)  # half a step of 8 bits at the top
     assert Clip.open(tmp_path / "out" / "test_00000").frame_rate == 2000.0
@@ -249,7 +249,7 @@ def test_a_cube_of_ours_keeps_its_orientation(tmp_path: Path):
     about = {"software": {"qsim": "0"}, "shape": [3, 4, 13], "orientation": "as stored"}
     (tmp_path / "c.npy.json").write_text(json.dumps(about))
     found = importing.read(tmp_path / "c.npy")
-    assert (found.shape, found.meta["orientation"]) == ((3, 4, 13), "as stored")
+    assert (found.shape, found.source.orientation) == ((3, 4, 13), "as stored")
 
 
 @pytest.mark.parametrize("bits", ["big", "little"])

@@ -24,7 +24,7 @@ from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
-from qsim.scene import Spin, Translation, describe
+from qsim.scene import Spin, Translation
 from qsim.scene.camera_path import read_camera_path
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import FixedPattern
@@ -119,13 +119,13 @@ def test_a_data_set_becomes_videos(tmp_path: Path):
     command = ["convert", str(tmp_path / "small"), str(tmp_path / "out"), "--to", "mp4"]
     assert main(command) == 0
     clips = Dataset.open(tmp_path / "small").clips()
-    names = {f"{clip.meta['split']}/{clip.name}.mp4": clip for clip in clips}
+    names = {f"{clip.info.split}/{clip.name}.mp4": clip for clip in clips}
     assert sorted(names) == ["test/tumble_0004.mp4", "train/fan_0000.mp4", "train/fan_0001.mp4"]
     made = [str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")]
     assert sorted(made) == sorted([*names, *(f"{name}.json" for name in names)])
     for name, clip in names.items():
         meta = json.loads((tmp_path / "out" / f"{name}.json").read_text())
-        assert (meta["shape"], meta["frame_rate"], meta["split"]) == ([*clip.shape], 2000.0, clip.meta["split"])
+        assert (meta["shape"], meta["frame_rate"], meta["split"]) == ([*clip.shape], 2000.0, clip.info.split)
         assert (meta["orientation"], meta["transfer"], meta["lossless"]) == ("upright", "gamma 2.2", True)
         radiance = np.stack([clip.radiance(t) for t in range(len(clip))]).astype(float)
         assert meta["white"] == pytest.approx(np.percentile(radiance[:, ::2, ::2], 99.9), rel=1e-6)
@@ -169,7 +169,7 @@ def test_a_clip_is_written_with_its_camera_path(tmp_path: Path, moves: bool):
     motion = Spin((0.2, 1, 0), 300.0) @ Translation((20.0, -10, 30)) if moves else None
     camera = Camera(2e-5, 2.8, 1e-6, 11, 15, lens=lens, origin=(1, 2, 3), motion=motion)
     poses = {"poses": [camera.pose(t / 2000.0).tolist() for t in range(4)]} if moves else {}
-    clip = write_clip(tmp_path / "clip", frames=4, height=7, width=10, camera=describe(camera), origin=[3, 4], **poses)
+    clip = write_clip(tmp_path / "clip", frames=4, height=7, width=10, camera=camera, origin=[3, 4], **poses)
     assert main(["convert", str(clip.path), str(tmp_path / "out"), "--to", "nerfstudio"]) == 0
     found = read_camera_path(tmp_path / "out" / "transforms.json")
     assert (found.height, found.width) == (7, 10)
@@ -185,13 +185,10 @@ def test_a_clip_is_written_with_its_camera_path(tmp_path: Path, moves: bool):
 
 
 def test_clips_without_poses_have_no_camera_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    moving = describe(Camera(2e-5, 2.8, 1e-6, 7, 10, motion=Spin((0, 1, 0), 1.0)))
     size = {"height": 7, "width": 10}
     for name, message, more in (
         ("relative", "has no camera", {"frames": 3, "relative": True}),
         ("one", "a camera path needs two or more", {"frames": 1}),
-        ("lost", "lacks a pose for each frame", {"frames": 3, "camera": moving}),
-        ("fewer", "lacks a pose for each frame", {"frames": 3, "camera": moving, "poses": [np.eye(4).tolist()] * 2}),
     ):
         write_clip(tmp_path / name, **size, **more)
         assert main(["convert", str(tmp_path / name), str(tmp_path / "out"), "--to", "nerfstudio"]) == 2
@@ -204,7 +201,7 @@ def test_clips_without_poses_have_no_camera_path(tmp_path: Path, capsys: pytest.
 
 def test_an_export_states_what_decides_its_codes(tmp_path: Path):
     """Defects, place in the frame and light level were left out: hot pixels had no reason."""
-    camera = describe(Camera(8e-3, 2.8, 1.1e-6, 11, 15))
+    camera = Camera(8e-3, 2.8, 1.1e-6, 11, 15)
     clip = write_clip(tmp_path / "clip", frames=2, height=7, width=10, camera=camera, origin=[3, 4])
     stream = clip.sense(BinarySPAD(0.4, 20.0), lux=50.0, defects=Defects(FixedPattern(dead=0.1)))
     exporting.export(stream, tmp_path / "a.npy", Export("cube"))

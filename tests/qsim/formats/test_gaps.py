@@ -58,10 +58,10 @@ def test_lost_pictures_are_told_and_kept_as_missing(tmp_path: Path):
         recording = importing.read(path, Hints(**hints))
     assert recording.shape == (5, 4, 6)
     clip = importing.to_clip(recording, tmp_path / "closed", CAPTURE)
-    assert clip.meta["times"]["values"] == [1, 2, 3, 7, 8]
+    assert clip.info.times.values == (1, 2, 3, 7, 8)
     kept = importing.to_clip(importing.read(path, Hints(**hints, keep_gaps=True)), tmp_path / "kept", CAPTURE)
-    assert kept.meta["source"]["missing_frames"] == [3, 4, 5]
-    assert kept.meta["times"]["values"] == list(range(1, 9))
+    assert kept.info.source.missing_frames == (3, 4, 5)
+    assert kept.info.times.values == tuple(range(1, 9))
     for t in range(8):
         missing = t in (3, 4, 5)
         assert kept.saturated(t).all() == missing

@@ -205,7 +205,7 @@ def test_orientation_tags_are_applied(tmp_path: Path, kind: str):
         expected = np.asarray(ImageOps.exif_transpose(shown))
         recording = importing.read(path, Hints(bits=8))
         np.testing.assert_array_equal(recording.read(0, 1)[0], expected)
-        assert recording.meta["orientation"] == (
+        assert recording.source.orientation == (
             "upright" if tag == 1 else f"upright: turned by its orientation tag {tag}"
         )
 

@@ -8,7 +8,7 @@ from clips import write_clip
 from recordings import CAPTURE, random_planes
 
 from qsim.cli.program import main
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.formats import exporting, importing, video
 from qsim.formats.exporting import Export
@@ -28,7 +28,7 @@ def test_the_ball_becomes_a_clip_of_relative_light(tmp_path: Path):
     assert main(line.split()) == 0
     clip = Clip.open(tmp_path / "ball")
     assert clip.shape == stored.shape
-    assert clip.meta["radiance_unit"] == RELATIVE
+    assert clip.info.radiance_unit == RELATIVE
     assert (clip.frame_rate, clip.exposure) == (30000.0, 20e-6)
     np.testing.assert_allclose(clip.radiance(1), stored[1] / 65535, rtol=2**-11)
     assert main(["sense", str(tmp_path / "ball"), "--bits", "3", "--ppp", "3.25"]) == 0
@@ -142,9 +142,9 @@ def test_light_that_halves_cannot_hold_is_scaled(tmp_path: Path, capsys, unit: f
         assert said in out
         assert (f"the light of the file is scaled by {scale:g}" in out) == (scale != 1)
         clip = Clip.open(tmp_path / "clip")
-        assert clip.meta["source"].get("scale", 1.0) == scale
+        assert (clip.info.source.scale or 1.0) == scale
         np.testing.assert_allclose([clip.radiance(t) for t in range(2)], light * scale, rtol=2.0**-11)
-        assert int(clip.meta.get("saturated_pixels", 0)) == len(white) // 2
+        assert clip.info.saturated_pixels == len(white) // 2
 
 
 def test_deep_pictures_are_not_cut(tmp_path: Path, capsys):
@@ -229,8 +229,8 @@ def test_saturated_pixels_are_counted_marked_and_reported(
     found = np.stack([clip.saturated(t) for t in range(3)])
     np.testing.assert_array_equal(found, mask[..., ::-1])
     np.testing.assert_array_equal(clip.saturated(2, (1, 2, 4, 5)), found[2, 1:5, 2:7])
-    assert clip.meta["saturated_pixels"] == clip.meta["clipped_pixels"] == mask.sum()
-    assert clip.meta["saturation"]["assumed"] == (white is None)
+    assert clip.info.saturated_pixels == clip.info.clipped_pixels == mask.sum()
+    assert clip.info.saturation.assumed == (white is None)
     assert sorted(path.name for path in (clip.path).glob("saturated/*")) == [
         f"{t:06d}.exr" for t in range(3) if mask[t].any()
     ]

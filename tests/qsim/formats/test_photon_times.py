@@ -156,7 +156,13 @@ def test_rows_at_their_own_time_are_stated(tmp_path):
     )
     assert photon_times.read(tmp_path / "p.npz").rows == Rows(5e-5, "up")
     assert main(["convert", str(tmp_path / "p.npz"), str(tmp_path / "clocked")]) == 0
-    assert Stream.open(tmp_path / "clocked.json").meta["source"]["rows"] == {"delay": 5e-5, "order": "up"}
+    assert Stream.open(tmp_path / "clocked.json").meta["source"] == {
+        "bit_order": "none: whole bytes per pixel",
+        "orientation": "upright",
+        "format": "photon times",
+        "row_delay": 5e-5,
+        "row_order": "up",
+    }
 
 
 def test_damaged_files_are_refused_in_one_line(tmp_path):

@@ -114,9 +114,9 @@ def test_the_bit_order_of_raw_files_is_said_as_it_is_read(tmp_path: Path, layout
     raw = np.zeros(size[0] * size[1] // 8, np.uint8)
     hints = Hints(layout, height=size[0], width=size[1]) if layout == "spike" else Hints(layout)
     raw.tofile(tmp_path / "a.raw")
-    said = importing.read(tmp_path / "a.raw", hints).meta
-    assert ("upside down, turned upright" in said["orientation"]) == (row > 0)
-    raw[0] = {"msb": 0x80, "lsb": 0x01}[said["bit_order"]]
+    said = importing.read(tmp_path / "a.raw", hints).source
+    assert ("upside down, turned upright" in said.orientation) == (row > 0)
+    raw[0] = {"msb": 0x80, "lsb": 0x01}[said.bit_order]
     raw.tofile(tmp_path / "a.raw")
     np.testing.assert_array_equal(importing.read(tmp_path / "a.raw", hints).read(0, 1), one((1, *size), (0, row, 0)))
 

@@ -149,7 +149,7 @@ def test_photron_recordings(tmp_path: Path, text: str, stored: int, depth: int, 
     np.testing.assert_allclose(recording.read(0, 3), frames / (2**depth - 1), rtol=1e-6)
     assert (recording.frame_rate, recording.exposure) == (20000, 2e-5)
     clip = importing.to_clip(recording, tmp_path / "clip", importing.Import(20000))
-    assert clip.meta["exposure"] == 2e-5
+    assert clip.exposure == 2e-5
     with pytest.raises(ValueError, match=r"--frame-rate 1000: Photron \.mraw state 20000; leave it out"):
         importing.to_clip(recording, tmp_path / "other", importing.Import(1000))
     np.testing.assert_array_equal(everything(beside), frames)

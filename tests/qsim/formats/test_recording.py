@@ -12,10 +12,12 @@ import raw_planes
 from recordings import CAPTURE, everything, random_planes
 from sdt_files import sdt_bytes
 
+from qsim.clip.source import Source
 from qsim.file_order import numbered
 from qsim.formats import array_files, detection, exporting, images, importing, photon_times, video
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints, Recording
+from qsim.streams.clip import Clip
 from qsim.streams.sensing import Sensing, sense
 
 
@@ -162,11 +164,14 @@ def test_every_reader_says_bit_order_and_orientation(tmp_path: Path, layout: str
     make = importing.to_clip if recording.is_light else importing.to_stream
     made = make(recording, tmp_path / "made", replace(CAPTURE, frame_rate=recording.frame_rate or 1000.0))
     order, rows = promised()[layout]
-    assert recording.meta["bit_order"].startswith(order)
-    assert recording.meta["orientation"].startswith(rows)
-    said = {key: recording.meta[key] for key in ("bit_order", "orientation")}
-    assert made.meta["source"] == made.meta["source"] | said
-    assert made.meta.get("orientation", said["orientation"]) == said["orientation"]
+    assert recording.source.bit_order.startswith(order)
+    assert recording.source.orientation.startswith(rows)
+    said = {key: getattr(recording.source, key) for key in ("bit_order", "orientation")}
+    if isinstance(made, Clip):
+        assert (made.info.source, made.info.orientation) == (recording.source, said["orientation"])
+    else:
+        assert made.meta["source"] == made.meta["source"] | said
+        assert made.meta["orientation"] == said["orientation"]
     exported = exporting.export(made, tmp_path / "out", Export("png"))
     assert json.loads((exported / "meta.json").read_text())["orientation"] == said["orientation"]
 
@@ -178,16 +183,18 @@ def test_a_disputed_side_stays_disputed_and_a_flip_is_remembered(tmp_path: Path)
         stream = importing.to_stream(
             importing.read(tmp_path / "a.bin", Hints("spad512s", flip=flip)), tmp_path / flip, CAPTURE
         )
-        assert (stream.meta["orientation"], stream.meta["source"]["flip_lr"]) == (said, "unknown")
+        assert stream.meta["orientation"] == stream.meta["source"]["orientation"] == said
         cube = exporting.export(stream, tmp_path / f"{flip}_cube.npy", Export("cube"))
         assert json.loads(cube.with_name(cube.name + ".json").read_text())["orientation"] == said
     np.save(tmp_path / "light.npy", np.ones((2, 3, 4), np.float32))
     clip = importing.to_clip(importing.read(tmp_path / "light.npy", Hints(flip="ud")), tmp_path / "clip", CAPTURE)
-    assert clip.meta["source"]["orientation"] == "upright; then --flip ud"
+    assert clip.info.source.orientation == "upright; then --flip ud"
     sensed, _ = sense(clip, Sensing("quiver-physical", ppp=3.25))
     assert sensed.meta["orientation"] == "upright; then --flip ud"
 
 
 def test_a_recording_of_unknown_orientation_is_not_called_upright(tmp_path: Path):
-    recording = Recording((1, 2, 8), lambda start, stop: random_planes(stop - start, 2, 8), "somewhere", 1)
+    recording = Recording(
+        (1, 2, 8), lambda start, stop: random_planes(stop - start, 2, 8), Source(format="somewhere"), 1
+    )
     assert importing.to_stream(recording, tmp_path / "s", CAPTURE).meta["orientation"] == "unknown"

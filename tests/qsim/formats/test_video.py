@@ -181,7 +181,7 @@ def test_colour_video_becomes_linear_luminance(tmp_path: Path, matrix: str, full
     options = ["--frame-rate", "2000", "--transfer", transfer, "--split", "train"]
     assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), *options]) == 0
     clip = Clip.open(tmp_path / "out" / "scene_clip")
-    assert (clip.shape, clip.meta["split"], clip.meta["source"]["transfer"]) == (rgb.shape[:3], "train", transfer)
+    assert (clip.shape, clip.info.split, clip.info.source.transfer) == (rgb.shape[:3], "train", transfer)
     inside = np.abs(np.arange(rgb.shape[2]) % 16 - 7.5) < 4
     kept = np.outer(inside[: rgb.shape[1]], inside)
     found = np.stack([clip.radiance(t) for t in range(len(clip))])[:, kept]

@@ -82,7 +82,7 @@ def test_a_repeat_gives_the_same_bytes_and_keeps_what_is_there(pictures, tmp_pat
     assert capsys.readouterr().out.endswith("1 clips made, 2 were there; 2 of these keep another split than val\n")
     for n in range(3):
         once, again = (Clip.open(tmp_path / name / f"warped_{n:05d}") for name in ("once", "again"))
-        assert once.meta["checksums"] == again.meta["checksums"]
+        assert once.info.checksums == again.info.checksums
         assert once.shape == (5, 24, 30)
         assert once.verify() == []
     assert (tmp_path / "once/LICENCE.txt").read_text() == "CC0"

@@ -9,6 +9,7 @@ from small_scenes import CHEAP, mirrored_sun, plate, renderer
 
 from qsim import scenes
 from qsim.backend import choose
+from qsim.clip.clip_info import SceneName
 from qsim.process import resident_memory
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
@@ -32,8 +33,8 @@ def test_an_interrupted_clip_resumes_with_the_same_bytes(tmp_path):
         render_clip(made, tmp_path / "broken", frames=4, budget=CHEAP, progress=stop)
     assert not (tmp_path / "broken").exists()
     resumed = render_clip(made, tmp_path / "broken", frames=4, budget=CHEAP)
-    assert resumed.meta["checksums"] == whole.meta["checksums"]
-    assert len(resumed.meta["error_per_frame"]) == 4
+    assert resumed.info.checksums == whole.info.checksums
+    assert len(resumed.info.error_per_frame) == 4
     assert resumed.flow(1).shape == (2, 24, 33)
     with pytest.raises(ValueError, match="at least one frame"):
         render_clip(made, tmp_path / "none", frames=0, budget=CHEAP)
@@ -48,8 +49,8 @@ def test_an_interrupted_clip_does_not_resume_with_another_scene(tmp_path):
         with pytest.raises(ValueError, match="2 frames exist, begun with other settings"):
             render_clip(other, tmp_path / "clip", frames=3, budget=CHEAP)
     clip = render_clip(plate(Spin((0, 0, 1), 200.0)), tmp_path / "clip", frames=3, budget=CHEAP)
-    assert len(clip.meta["scene_sha256"]) == 64
-    assert clip.meta["scene"] == {"family": "test", "seed": 0, "speed": 1.0}
+    assert len(clip.info.scene_sha256) == 64
+    assert clip.info.scene == SceneName(family="test", seed=0, speed=1.0)
 
 
 def test_a_clip_counts_its_fireflies(tmp_path):
@@ -57,10 +58,10 @@ def test_a_clip_counts_its_fireflies(tmp_path):
     made = mirrored_sun()
     clip = render_clip(made, tmp_path / "mirror", frames=2, budget=Budget(8, 4))
     counted = [renderer(made, budget=Budget(8, 4)).frame(t, with_truth=False).fireflies for t in range(2)]
-    assert clip.meta["fireflies_per_frame"] == counted
+    assert list(clip.info.fireflies_per_frame) == counted
     assert sum(counted) > 0
-    assert len(clip.meta["error_per_frame"]) == 2
-    assert clip.meta["render"]["bounces"] == 4
+    assert len(clip.info.error_per_frame) == 2
+    assert clip.info.render.bounces == 4
 
 
 @pytest.mark.skipif(choose().backend == "scalar", reason="the scalar engine keeps no memory of freed arrays")

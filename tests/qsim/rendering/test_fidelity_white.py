@@ -93,11 +93,11 @@ def test_a_rendered_clip_states_its_error_below_its_own_white(tmp_path, capsys):
     clip = Clip.open(tmp_path / "fan")
     text = capsys.readouterr().out
     radiance = np.stack([clip.radiance(t) for t in range(2)]).astype(np.float64)
-    assert clip.meta["white"] == pytest.approx(white_in(radiance), rel=1e-3)
-    assert clip.meta["render"]["white"] == pytest.approx(clip.meta["white"], rel=0.5)
-    assert clip.meta["psnr_of_truth"] >= clip.meta["psnr_unclamped"]
+    assert clip.info.white == pytest.approx(white_in(radiance), rel=1e-3)
+    assert clip.info.render.white == pytest.approx(clip.info.white, rel=0.5)
+    assert clip.info.psnr_of_truth >= clip.info.psnr_unclamped
     for words in ("20 dB below white", "of the pixels are brighter", "clamped there, as in scores", "without a clamp",
-                  "% of the pixels move", "mean light", "the bounces left out", stated(clip.meta).line):  # fmt: skip
+                  "% of the pixels move", "mean light", "the bounces left out", stated(clip.info).line):  # fmt: skip
         assert words in text, words
 
 

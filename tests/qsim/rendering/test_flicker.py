@@ -118,11 +118,11 @@ def test_a_lamp_that_is_dark_in_first_middle_and_last_frame_does_not_fool_the_bu
     budget = choose_budget(made, frame_rate=400.0, frames=9, psnr=36, denoise=False)
     assert "light0 0 to 2 of its mean" in next(f.size for f in budget.findings if f.effect == "flicker")
     clip = render_clip(made, tmp_path / "clip", frames=9, frame_rate=400.0, budget=budget)
-    assert stated(clip.meta).psnr >= 35.5
+    assert stated(clip.info).psnr >= 35.5
     np.testing.assert_array_equal(clip.strengths["light0"], strengths)
     means = np.array([clip[t].mean() for t in range(9)])
     np.testing.assert_allclose(means / means.max(), strengths / strengths.max(), atol=0.01)
-    assert clip.meta["flicker"]["light0"]["kind"] == "PulseWidth"
+    assert clip.info.flicker["light0"].kind == "PulseWidth"
 
 
 def test_a_lamp_that_flashes_in_few_frames_gets_a_budget():
@@ -161,5 +161,5 @@ def test_motion_within_three_instants_of_flickering_light_is_listed():
 
 def test_steady_light_has_no_entry(tmp_path):
     clip = render_clip(scene(WALL), tmp_path / "clip", frames=1, budget=CHEAP)
-    assert "flicker" not in clip.meta
+    assert not clip.info.flicker
     assert clip.strengths == {}

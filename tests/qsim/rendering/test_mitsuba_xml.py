@@ -92,7 +92,7 @@ def test_our_camera_gives_the_picture_of_the_files_camera(room):
 def test_a_clip_names_its_file_and_rendering_by_name_works(room, tmp_path):
     scene = scenes.load(room)
     clip = render_clip(scene, tmp_path / "clip", frames=1, budget=Budget(2, 1))
-    assert clip.meta["scene"]["family"] == "room"
+    assert clip.info.scene.family == "room"
     assert len(scene.to_dict()["file"]["sha256"]) == 64
     assert scene.resized(48, 66).camera.height == 48
 
@@ -161,7 +161,7 @@ def test_a_clip_states_the_flicker_of_a_file(tmp_path):
     scene = read_mitsuba(path, flickers={"bulb": Mains(100.0)})
     clip = render_clip(scene, tmp_path / "clip", frames=3, frame_rate=RATE, budget=BUDGET)
     assert set(clip.strengths) == {"bulb"}
-    assert clip.meta["flicker"]["bulb"]["frequency"] == 100.0
+    assert clip.info.flicker["bulb"].frequency == 100.0
     assert scene.to_dict()["file"]["flickers"]["bulb"]["kind"] == "Mains"
     assert "flickers" not in read_mitsuba(path).to_dict()["file"]
 

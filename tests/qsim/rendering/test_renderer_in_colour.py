@@ -120,8 +120,8 @@ def test_a_budget_is_chosen_and_a_clip_states_its_bands(tmp_path):
     assert clip.bands == RGB
     assert clip.shape == (2, 24, 33)
     assert clip[1].shape == (3, 24, 33)
-    assert clip.meta["psnr_of_truth"] > 28
-    assert clip.meta["render"]["variant"].endswith("_rgb")
+    assert clip.info.psnr_of_truth > 28
+    assert clip.info.render.variant.endswith("_rgb")
 
 
 def test_mistakes_are_named():

@@ -8,7 +8,7 @@ from clips import square_clip
 
 from qsim import files
 from qsim.cli.program import main
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.streams.clip import Clip
 

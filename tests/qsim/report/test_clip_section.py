@@ -9,7 +9,7 @@ from stats import mixture_p_value
 
 from qsim import files
 from qsim.cli.program import main
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.optics.radiometry import RGB
 from qsim.report import clip_section, report

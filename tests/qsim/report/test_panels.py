@@ -10,7 +10,7 @@ from sensor_files import SPAD, sensor_file
 from qsim import colour
 from qsim.cli.program import main
 from qsim.clip.clamped_error import white_in
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.report import panels, views
 from qsim.sensor.colour_filter import MASKS, ColourFilter

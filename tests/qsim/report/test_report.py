@@ -10,7 +10,7 @@ from clips import write_clip, write_dataset
 
 from qsim import files
 from qsim.cli.program import main
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.report import report
 from qsim.streams.clip import Clip

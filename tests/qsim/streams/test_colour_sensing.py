@@ -71,8 +71,8 @@ def test_a_given_sensor_needs_no_file(place):
 def test_crops_keep_the_phase_of_the_mask(place):
     """A clip that is a window of the frame sees the filters, and the lens, of its place."""
     whole = colour_clip(place / "c", frames=1, height=9, width=11)
-    meta = {"camera": whole.meta["camera"], "origin": [3, 2]}
-    window = write_clip(place / "w", radiance=whole.radiance(0)[None, :, 3:8, 2:9], bands=whole.meta["bands"], **meta)
+    meta = {"camera": whole.info.camera, "origin": [3, 2]}
+    window = write_clip(place / "w", radiance=whole.radiance(0)[None, :, 3:8, 2:9], bands=whole.info.bands, **meta)
     wanted = Sensing("mine.toml")
     one = prepare(whole, wanted)
     other = prepare(window, wanted)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tiny_clip import FRAMES, write
 
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.streams.photons import clip_photons, light_level, light_line

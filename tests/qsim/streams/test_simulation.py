@@ -133,7 +133,7 @@ def whole_and_crop(folder: Path, place: tuple[int, int]) -> tuple[Clip, Clip]:
     whole = write_clip(folder / "whole" / "c", radiance=0.02 * sliding_pattern(6, 12, 18, 1))
     y, x = place
     light = np.stack([whole.radiance(t) for t in range(6)])[:, y : y + 7, x : x + 9]
-    return whole, write_clip(folder / "crop" / "c", radiance=light, camera=whole.meta["camera"], origin=[y, x])
+    return whole, write_clip(folder / "crop" / "c", radiance=light, camera=whole.info.camera, origin=[y, x])
 
 
 @pytest.mark.parametrize("place", [(3, 4), (5, 6)])  # packing begins inside a block of random words, or not

@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 from sensor_files import QIS, sensor_file
 
 from qsim import files
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.optics.radiometry import RGB
 from qsim.streams.clip import Clip
@@ -231,7 +231,7 @@ def test_truth_psnr_is_the_radiance_error_in_units_of_white(make_clip: ClipMaker
     assert truth_psnr(clip, factor, 8.125, range(4)) == pytest.approx(expected)
     assert truth_psnr(make_clip("unknown", error=None), 1.0, 8.125, range(4)) is None
     # Measured clamped at white, it counts up to 2.5 x the mean light; a higher peak takes the unclamped one.
-    halved = replace(clip, meta=clip.meta | {"error_at_white_per_frame": [0.005] * len(clip)})
+    halved = replace(clip, info=replace(clip.info, error_at_white_per_frame=[0.005] * len(clip)))
     half = -20 * math.log10(0.005 * (3.25 / clip.mean_radiance) / 8.125)
     assert truth_psnr(halved, factor, 8.125, range(4)) == pytest.approx(half)
     assert truth_psnr(halved, factor, 16.25, range(4)) == truth_psnr(clip, factor, 16.25, range(4))
@@ -513,7 +513,7 @@ def test_a_colour_clip_with_saturated_pixels_is_scored(tmp_path):
         for t in range(3):
             writer.add(t, np.full((3, 16, 18), 0.5), saturated=mask)
     clip = Clip.open(tmp_path / "c")
-    assert clip.meta["saturated_pixels"] > 0
+    assert clip.info.saturated_pixels > 0
     stream = clip.sense("quiver-physical", ppp=3.25, bits=3, colour="rggb", name="s")
     assert known(clip, 0, 3) is None
     assert stream.known() is None

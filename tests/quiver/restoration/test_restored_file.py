@@ -133,7 +133,7 @@ def test_a_restoration_of_something_else_starts_again(tmp_path, make_clip, block
         case "sensed clip":
             clip = make_clip(frames=10)
             before = sensed(clip, Illumination())[0]
-            after = sensed(replace(clip, meta=clip.meta | {"checksums": {}}), Illumination())[0]  # of other contents
+            after = sensed(replace(clip, info=replace(clip.info, checksums={})), Illumination())[0]  # of other contents
         case "weights":
             options = RestoreOptions(device="cpu")
             old, new = (restorer(str(weights(tmp_path, seed)), options) for seed in (0, 1))

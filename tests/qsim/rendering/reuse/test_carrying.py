@@ -157,14 +157,14 @@ def test_an_interrupted_clip_that_shares_samples_resumes_with_the_same_bytes(tmp
     with pytest.raises(KeyboardInterrupt):
         render_clip(made, tmp_path / "broken", frames=4, budget=budget, progress=stop)
     resumed = render_clip(made, tmp_path / "broken", frames=4, budget=budget)
-    assert resumed.meta["checksums"] == whole.meta["checksums"]
-    assert resumed.meta["error_per_frame"] == whole.meta["error_per_frame"]
-    assert whole.meta["render"]["neighbours"] == 2
-    stated = whole.meta["error_at_white_per_frame"]
+    assert resumed.info.checksums == whole.info.checksums
+    assert resumed.info.error_per_frame == whole.info.error_per_frame
+    assert whole.info.render.neighbours == 2
+    stated = whole.info.error_at_white_per_frame
     for t in (0, 3):
         frame = renderer(made, budget=budget, frames=4).frame(t)
         rounded = np.sqrt(np.mean((frame.radiance - whole.radiance(t)) ** 2))
-        assert stated[t] == pytest.approx(np.hypot(error_at(whole.meta["white"], frame.errors_at), rounded), rel=1e-3)
+        assert stated[t] == pytest.approx(np.hypot(error_at(whole.info.white, frame.errors_at), rounded), rel=1e-3)
 
 
 def test_an_edge_keeps_its_mixture_where_a_neighbour_hides_one_side():

@@ -8,7 +8,7 @@ from stats import critical_z
 from waves import wave_clip
 
 from qsim.cli.program import main
-from qsim.clip.manifest import RELATIVE
+from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.report import clip_section
 from qsim.streams.clip import Clip

@@ -1,11 +1,15 @@
 """Tests the clips of a study: one clip at several speeds, grouped frames, and another clip in the way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from clips import write_clip
 from waves import SIZE, wave_clip
 
+from qsim import records
 from qsim.cli.program import main
+from qsim.clip.clip_info import SceneName
 from qsim.dataset.redraw import redraw
 from qsim.rendering import clip_rendering, fidelity
 from qsim.streams.clip import Clip
@@ -77,9 +81,16 @@ def test_another_clip_in_the_place_of_a_rendered_one_is_refused(tmp_path):
 def test_a_clip_of_an_edited_scene_file_is_refused(tmp_path, monkeypatch):
     """The digests of the files that a scene reads are stored with its clip, and compared before it is taken."""
 
-    def rendered(scene, path, *, frames, frame_rate, extra, **_):
+    def rendered(scene, path, *, frames, frame_rate, made_of, **_):
         about = {"family": scene.name, "seed": scene.seed, "speed": scene.speed}
-        return write_clip(path, frames=frames, height=6, width=8, frame_rate=frame_rate, scene=about, **(extra or {}))
+        return write_clip(
+            path,
+            frames=frames,
+            height=6,
+            width=8,
+            frame_rate=frame_rate,
+            **vars(replace(made_of, scene=SceneName(**about))),
+        )
 
     monkeypatch.setattr(clip_rendering, "render_clip", rendered)
     monkeypatch.setattr(fidelity, "choose_budget", lambda *_, **__: None)
@@ -87,9 +98,9 @@ def test_a_clip_of_an_edited_scene_file_is_refused(tmp_path, monkeypatch):
     shape = ClipShape(2, 6, 8, frame_rate=10_000.0)
     file.write_text("from qsim.scenes.plain import scene\n")
     made = render(str(file), tmp_path / "own_x1", shape)
-    assert list(made.meta["reads"]) == ["own.py"]
-    assert render(str(file), tmp_path / "own_x1", shape).meta == made.meta
-    assert "reads" not in render("plain", tmp_path / "plain_x1", shape).meta
+    assert list(made.info.reads) == ["own.py"]
+    assert records.plain(render(str(file), tmp_path / "own_x1", shape).info) == records.plain(made.info)
+    assert not render("plain", tmp_path / "plain_x1", shape).info.reads
     assert render("plain", tmp_path / "plain_x1", shape)
     file.write_text("from qsim.scenes.plain import scene\n\n")
     with pytest.raises(FileExistsError, match=r"own\.py and its files as they are now; name another folder with -o"):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from qsim.clip.manifest import PHYSICAL, RELATIVE
+from qsim import records
+from qsim.clip.clip_info import PHYSICAL, RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.optics.camera import Camera
 from qsim.optics.radiometry import photons_per_lux
@@ -17,9 +18,7 @@ def still_clip(path, frames: int, rate: float, camera: Camera | None = None) -> 
     """Write a clip of an even grey field that never changes."""
     meta = {"shape": [frames, *SIZE], "frame_rate": rate, "exposure": 1 / rate, "radiance_unit": RELATIVE}
     if camera is not None:
-        from qsim.scene import describe
-
-        meta |= {"radiance_unit": PHYSICAL, "camera": describe(camera)}
+        meta |= {"radiance_unit": PHYSICAL, "camera": records.plain(camera)}
     with ClipWriter(path, meta) as writer:
         for t in range(frames):
             writer.add(t, np.ones(SIZE, np.float32))

@@ -1,0 +1,40 @@
+"""Reads and writes descriptions: JSON files that hold one record, the version of their format, and their own checksum.
+
+    record --write--> {"format_version": 1, "checksum": SHA-256 of the other keys, field: value, ...} --read--> record
+
+Fields that hold their default are left out. Damage, another version and unknown keys are refused with the file's name.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeVar
+
+from qsim import files, records
+
+FORMAT_VERSION = 1  # of clips, streams, data sets and restored videos; only this one is read
+Made = TypeVar("Made")
+
+
+def values_of(record: Any) -> dict[str, Any]:
+    """Return what the file of a record holds."""
+    return files.sealed({"format_version": FORMAT_VERSION} | records.plain(record))
+
+
+def write(path: Path, record: Any) -> str:
+    """Write a record atomically; return the SHA-256 of the file."""
+    return files.write_json(path, values_of(record))
+
+
+def read(path: Path, kind: type[Made], cure: str) -> Made:
+    """Return the record in a file; `ValueError` that ends with `cure` if it is damaged or of another version."""
+    return of_values(path, files.read_json(path), kind, cure)
+
+
+def of_values(path: Path, found: dict[str, Any], kind: type[Made], cure: str) -> Made:
+    """Return the record in the contents of a file; errors as of `read`."""
+    files.check_version(path, found.get("format_version"), FORMAT_VERSION)
+    values = {key: value for key, value in found.items() if key not in ("format_version", "checksum")}
+    record = records.convert(values, kind, str(path), cure=cure)
+    files.check_own(path, found, cure)
+    return record
