@@ -11,7 +11,6 @@ another process needs, each wait then lasts until the scheduler intervenes. So c
 from __future__ import annotations
 
 import os
-import sys
 import time
 from dataclasses import dataclass
 from functools import cache
@@ -53,12 +52,8 @@ def use(wanted: int | None = None, earlier: int | None = None) -> Threads:
     `ValueError` if fewer than 1 or more than the machine's cores are wanted.
     """
     check(wanted)
-    try:
-        import torch
-    except ModuleNotFoundError:
-        if wanted is not None:
-            raise
-        return Threads(1, "torch is not installed")
+    import torch
+
     if wanted is not None:
         chosen = Threads(wanted, "as asked for")
     elif earlier is not None:
@@ -69,9 +64,11 @@ def use(wanted: int | None = None, earlier: int | None = None) -> Threads:
     return chosen
 
 
-def current() -> int | None:
-    """Return torch's number of threads; None where torch was not needed."""
-    return sys.modules["torch"].get_num_threads() if "torch" in sys.modules else None
+def current() -> int:
+    """Return torch's number of threads."""
+    import torch
+
+    return torch.get_num_threads()
 
 
 def recorded(path: Path) -> int | None:

@@ -61,7 +61,7 @@ _ALSO_CALLED = {
 OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
     "networks": (
         ("torch", "safetensors", "tensorboard"),
-        "networks and path-merge: quiver train, quiver restore, quiver evaluate",
+        "quiver: restoring, training, evaluating",
     ),
     "video": (("av",), "video files: qsim convert, qsim preview"),
     "formats": (("zarr", "h5py"), "Zarr and HDF5 files: qsim convert, qsim calibrate"),
@@ -303,7 +303,8 @@ def one_line(error: BaseException) -> str:
         return f"{wording(error)}; no incomplete file is left; make space and run the same command again"
     if isinstance(error, ModuleNotFoundError):
         package = (error.name or "").split(".")[0]
-        return f"needs the package {package}, which is not installed: pip install {package}"
+        extra = next((f"; the extra {name} has it" for name, (all_of, _) in OPTIONAL.items() if package in all_of), "")
+        return f"needs the package {package}, which is not installed: pip install {package}{extra}"
     if isinstance(error, MemoryError):
         return f"not enough memory ({' '.join(str(error).split()) or 'none is left'}); try fewer or smaller frames"
     return wording(error)

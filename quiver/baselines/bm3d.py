@@ -18,16 +18,13 @@ used: its licence forbids commercial use.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy import ndarray as Array
+from torch import Tensor
 
 from qsim.arrays import plain
-from quiver.baselines.arrays import add_at, single, smallest, strided, whole, xp, zeros
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 BLOCK = 8  # pixels, side of a block
 AREA = BLOCK * BLOCK
@@ -65,7 +62,7 @@ def denoise(image: Array, sigma: float, *, peak: float = 1.0, profile: Profile =
         return image.astype(np.float32)
     grey = 255.0 / peak
     level = float(image.mean(dtype=np.float64))  # subtracted: float32 loses less
-    noisy = single(pad((image - level) * grey))
+    noisy = torch.asarray(pad((image - level) * grey), dtype=torch.float32)
     coefficients = block_table(noisy)
     basic = aggregate(*threshold_step(coefficients, noisy.shape, sigma * grey, profile), noisy.shape)
     final = aggregate(*wiener_step(coefficients, basic, sigma * grey, profile), noisy.shape)
@@ -84,7 +81,7 @@ def dct_matrix() -> Tensor:
     n = np.arange(BLOCK)
     one = np.cos(np.pi * (2 * n[None, :] + 1) * n[:, None] / (2 * BLOCK)) * np.sqrt(2 / BLOCK)
     one[0] /= np.sqrt(2)
-    return single(np.kron(one, one))
+    return torch.asarray(np.kron(one, one), dtype=torch.float32)
 
 
 def wavelet_matrix() -> Tensor:
@@ -100,7 +97,7 @@ def wavelet_matrix() -> Tensor:
         one[:size] = level @ one[:size]
         size //= 2
     one /= np.linalg.norm(one, axis=1, keepdims=True)
-    return single(np.kron(one, one))
+    return torch.asarray(np.kron(one, one), dtype=torch.float32)
 
 
 def haar_matrix(size: int) -> Tensor:
@@ -109,7 +106,7 @@ def haar_matrix(size: int) -> Tensor:
     while len(matrix) < size:
         fine = np.kron(np.eye(len(matrix)), [1, -1])
         matrix = np.concatenate([np.kron(matrix, [1, 1]), fine]) / np.sqrt(2)
-    return single(matrix)
+    return torch.asarray(matrix, dtype=torch.float32)
 
 
 def table_size(shape: tuple[int, ...]) -> tuple[int, int, int, int]:
@@ -123,10 +120,11 @@ def table_size(shape: tuple[int, ...]) -> tuple[int, int, int, int]:
 def block_table(image: Tensor) -> Tensor:
     """Return the DCT of the block at every position: rows [table height * table width, 64]; zeros outside the image."""
     _, _, height, width = table_size(image.shape)
-    table = zeros(height, width, AREA)
+    table = torch.zeros(height, width, AREA)
     side = image.shape[1]
     shape = image.shape[0] - BLOCK + 1, side - BLOCK + 1, BLOCK, BLOCK
-    blocks = strided(image, shape, (side, 1, side, 1))  # [positions down, across, 8, 8], a view
+    # Strides are those of C order: an image of another order is copied.
+    blocks = image.contiguous().as_strided(shape, (side, 1, side, 1))  # [positions down, across, 8, 8], a view
     basis = dct_matrix().T
     for y, row in enumerate(blocks):
         table[y + RADIUS, RADIUS : RADIUS + len(row)] = row.reshape(-1, AREA) @ basis
@@ -136,7 +134,7 @@ def block_table(image: Tensor) -> Tensor:
 def inside_image(shape: tuple[int, ...]) -> Tensor:
     """Return which positions of the table [height, width] hold a block of the image."""
     _, _, height, width = table_size(shape)
-    inside = xp.zeros((height, width), dtype=xp.bool)
+    inside = torch.zeros((height, width), dtype=torch.bool)
     inside[RADIUS : RADIUS + shape[0] - BLOCK + 1, RADIUS : RADIUS + shape[1] - BLOCK + 1] = True
     return inside
 
@@ -156,38 +154,37 @@ def match_blocks(
     _, across, _, width = table_size(shape)
     top = tile_row * TILE * STEP
     jump = TILE * STEP
-    view = strided(table, (across, REACH, REACH, AREA), (jump * AREA, width * AREA, AREA, 1), top * width * AREA)
+    view = table.as_strided((across, REACH, REACH, AREA), (jump * AREA, width * AREA, AREA, 1), top * width * AREA)
     candidates = view.reshape(across, REACH * REACH, AREA)
     reference = view[:, RADIUS : -RADIUS or None : STEP, RADIUS : -RADIUS or None : STEP]
     reference = reference.reshape(across, TILE * TILE, AREA)
-    far = strided(norm, (across, 1, REACH, REACH), (jump, 0, width, 1), top * width)
+    far = norm.as_strided((across, 1, REACH, REACH), (jump, 0, width, 1), top * width)
     distance = (reference @ candidates.mT).reshape(across, TILE * TILE, REACH, REACH)
     distance *= -2
     distance += far  # the reference's own norm is added to its winners below
     # From the region of the tile to the window of each block: windows of neighbours lie STEP positions apart.
     side = 2 * RADIUS + 1
     area = REACH * REACH
-    window = strided(
-        distance,
+    window = distance.as_strided(
         (across, TILE, TILE, side, side),
         (TILE * TILE * area, TILE * area + STEP * REACH, area + STEP, REACH, 1),
     ).reshape(across, TILE, TILE, side * side)
     window[..., side * RADIUS + RADIUS] = -FAR
-    best, index = smallest(window, stack)
-    corner = top * width + xp.arange(across)[:, None, None] * jump
-    corner = corner + xp.arange(TILE)[:, None] * STEP * width + xp.arange(TILE) * STEP
+    best, index = window.topk(stack, largest=False)
+    corner = top * width + torch.arange(across)[:, None, None] * jump
+    corner = corner + torch.arange(TILE)[:, None] * STEP * width + torch.arange(TILE) * STEP
     position = corner[..., None] + index // side * width + index % side
     own = norm.reshape(-1)[position[..., 0]]
     similar = (best + own[..., None] <= limit * AREA).sum(-1)
     exists = own < FAR
-    size = 2 ** whole(xp.floor(xp.log2(xp.clip(similar, 1, None))))
+    size = 2 ** similar.clip(min=1).log2().floor().long()
     return Matches(position[exists], size[exists])
 
 
 def norms(table: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return the squared length of every row [table height, width]; FAR outside the image."""
     inside = inside_image(shape)
-    return xp.where(inside, xp.square(table).sum(1).reshape(inside.shape), FAR)
+    return torch.where(inside, torch.square(table).sum(1).reshape(inside.shape), FAR)
 
 
 def similar_blocks(table: Tensor, shape: tuple[int, ...], stack: int, limit: float) -> list[Tensor]:
@@ -203,32 +200,32 @@ def similar_blocks(table: Tensor, shape: tuple[int, ...], stack: int, limit: flo
 
 def threshold_step(table: Tensor, shape: tuple[int, ...], sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
     """Return sums of weighted rows [positions, 64] after hard thresholding, and of their weights [positions]."""
-    total = xp.zeros_like(table)
-    weights = zeros(len(table))
+    total = torch.zeros_like(table)
+    weights = torch.zeros(len(table))
     to_wavelet = wavelet_matrix() @ dct_matrix().T
     wavelets = table @ to_wavelet.T
     for position in similar_blocks(table, shape, profile.stack, profile.limit + 2 * sigma**2):
         haar = haar_matrix(position.shape[1])
         stack = haar @ wavelets[position]
-        small = xp.abs(stack) < profile.threshold * sigma
+        small = torch.abs(stack) < profile.threshold * sigma
         small[:, 0, 0] = False
         stack[small] = 0
-        weight = 1 / (sigma**2 * xp.clip(xp.count_nonzero(stack, (1, 2)), 1, None))
+        weight = 1 / (sigma**2 * torch.clip(torch.count_nonzero(stack, (1, 2)), 1, None))
         add_blocks(total, weights, position, haar.T @ stack, weight)
-    return total @ xp.linalg.inv(to_wavelet).T, weights
+    return total @ torch.linalg.inv(to_wavelet).T, weights
 
 
 def wiener_step(table: Tensor, basic: Tensor, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
     """Return the same sums after an empirical Wiener filter, whose spectrum comes from the basic estimate."""
-    total = xp.zeros_like(table)
-    weights = zeros(len(table))
+    total = torch.zeros_like(table)
+    weights = torch.zeros(len(table))
     pilot_table = block_table(basic)
     for position in similar_blocks(pilot_table, basic.shape, profile.second_stack, profile.second_limit):
         haar = haar_matrix(position.shape[1])
-        power = xp.square(haar @ pilot_table[position])
+        power = torch.square(haar @ pilot_table[position])
         gain = power / (power + sigma**2)
         gain[:, 0, 0] = 1
-        weight = 1 / (sigma**2 * xp.square(gain).sum((1, 2)))
+        weight = 1 / (sigma**2 * torch.square(gain).sum((1, 2)))
         stack = gain * (haar @ table[position])
         add_blocks(total, weights, position, haar.T @ stack, weight)
     return total, weights
@@ -236,19 +233,19 @@ def wiener_step(table: Tensor, basic: Tensor, sigma: float, profile: Profile) ->
 
 def add_blocks(total: Tensor, weights: Tensor, position: Tensor, stack: Tensor, weight: Tensor) -> None:
     """Add weighted stacks [n, size, 64] to the running sums, at their positions."""
-    weight = single(weight)[:, None]
-    add_at(total, position.reshape(-1), (stack * weight[..., None]).reshape(-1, AREA))
-    add_at(weights, position.reshape(-1), xp.broadcast_to(weight, position.shape).reshape(-1))
+    weight = weight[:, None]
+    total.index_add_(0, position.reshape(-1), (stack * weight[..., None]).reshape(-1, AREA))
+    weights.index_add_(0, position.reshape(-1), torch.broadcast_to(weight, position.shape).reshape(-1))
 
 
 def aggregate(total: Tensor, weights: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return the weighted mean of all overlapping filtered blocks: an image of this shape."""
     height, width = table_size(shape)[2:]
-    kaiser = single(np.kaiser(BLOCK, KAISER))
-    kaiser = xp.outer(kaiser, kaiser).reshape(-1)
+    kaiser = torch.asarray(np.kaiser(BLOCK, KAISER), dtype=torch.float32)
+    kaiser = torch.outer(kaiser, kaiser).reshape(-1)
     pixels = (dct_matrix().T @ total.T * kaiser[:, None]).reshape(AREA, height, width)
     weight = weights.reshape(height, width)
-    above, below = zeros(2, height + BLOCK - 1, width + BLOCK - 1)
+    above, below = torch.zeros(2, height + BLOCK - 1, width + BLOCK - 1)
     for k in range(AREA):
         y, x = divmod(k, BLOCK)
         above[y : y + height, x : x + width] += pixels[k]

@@ -15,12 +15,9 @@ reference to the other image: reference(p) is like other(p + shift).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from quiver.baselines.arrays import mixed, single, whole, xp, zeros
-
-if TYPE_CHECKING:
-    from torch import Tensor
+import torch
+from torch import Tensor
 
 MULTIPLE = 64  # of the sides of an image, which pyramid and patch sizes divide
 
@@ -44,7 +41,7 @@ TIE = 1e-5  # mean absolute difference per pixel, in the unit of the images, bel
 
 def pad_image(image: Tensor) -> Tensor:
     """Return the image with bottom and right replicated until both sides are multiples of 64."""
-    y, x = (xp.clip(xp.arange(side + -side % MULTIPLE), None, side - 1) for side in image.shape)
+    y, x = (torch.clip(torch.arange(side + -side % MULTIPLE), None, side - 1) for side in image.shape)
     return image[y[:, None], x[None]]
 
 
@@ -54,23 +51,23 @@ def pyramid(image: Tensor, levels: tuple[Level, ...] = LEVELS) -> list[Tensor]:
     for level in levels[1:]:
         fine = images[-1]
         step = level.ratio
-        images.append(sum((fine[y::step, x::step] for y in range(step) for x in range(step)), zeros(1)) / step**2)
+        images.append(sum((fine[y::step, x::step] for y in range(step) for x in range(step)), torch.zeros(1)) / step**2)
     return images
 
 
 def grid(shape: tuple[int, ...], level: Level) -> tuple[Tensor, int, int]:
     """Return the upper left corners [2, N] (y, x) of the patches in raster order, and their number down and across."""
     down, across = ((side - level.patch) // level.stride + 1 for side in shape)
-    y, x = xp.meshgrid(xp.arange(down), xp.arange(across), indexing="ij")
-    return xp.stack([y.reshape(-1), x.reshape(-1)]) * level.stride, down, across
+    y, x = torch.meshgrid(torch.arange(down), torch.arange(across), indexing="ij")
+    return torch.stack([y.reshape(-1), x.reshape(-1)]) * level.stride, down, across
 
 
 def gather(image: Tensor, corner: Tensor, size: int) -> Tensor:
     """Return squares [size, size, N] with these upper left corners [2, N]; outside, the border repeats."""
     height, width = image.shape
-    step = xp.arange(size)
-    y = xp.clip(corner[0] + step[:, None], 0, height - 1) * width
-    x = xp.clip(corner[1] + step[:, None], 0, width - 1)
+    step = torch.arange(size)
+    y = torch.clip(corner[0] + step[:, None], 0, height - 1) * width
+    x = torch.clip(corner[1] + step[:, None], 0, width - 1)
     return image.reshape(-1)[y[:, None] + x[None]]
 
 
@@ -81,20 +78,20 @@ def search(patches: Tensor, other: Tensor, corner: Tensor, centre: Tensor, radiu
     codes are often equal, and rounding, which differs between machines, must not choose.
     """
     size = patches.shape[0]
-    limit = xp.asarray(other.shape)[:, None]
+    limit = torch.asarray(other.shape)[:, None]
     low = -corner
     high = limit - patches.shape[0] - corner
-    centre = xp.maximum(xp.minimum(centre, high + radius), low - radius)
+    centre = torch.maximum(torch.minimum(centre, high + radius), low - radius)
     window = gather(other, corner + centre - radius, size + 2 * radius)
     best = centre
-    least = xp.full(corner.shape[1:], xp.inf, dtype=xp.float32)
+    least = torch.full(corner.shape[1:], torch.inf, dtype=torch.float32)
     for v in range(2 * radius + 1):
         for u in range(2 * radius + 1):
-            shift = centre + xp.asarray([[v - radius], [u - radius]])
-            cost = xp.abs(window[v : v + size, u : u + size] - patches).sum((0, 1))
+            shift = centre + torch.asarray([[v - radius], [u - radius]])
+            cost = torch.abs(window[v : v + size, u : u + size] - patches).sum((0, 1))
             better = (cost < least - TIE * size**2) & ((shift >= low) & (shift <= high)).all(0)
-            best = xp.where(better, shift, best)
-            least = xp.where(better, cost, least)
+            best = torch.where(better, shift, best)
+            least = torch.where(better, cost, least)
     return best, least
 
 
@@ -106,40 +103,40 @@ def derivatives(image: Tensor) -> tuple[Tensor, Tensor]:
 def _slope(image: Tensor) -> Tensor:
     """Return the derivative along the rows' index."""
     height = len(image)
-    wide = image[xp.asarray([1, 0, *range(height), height - 1, height - 2])]
+    wide = image[torch.asarray([1, 0, *range(height), height - 1, height - 2])]
     kernel = (1 / 12, -8 / 12, 0.0, 8 / 12, -1 / 12)
-    return sum((k * wide[i : i + height] for i, k in enumerate(kernel) if k), zeros(1))
+    return sum((k * wide[i : i + height] for i, k in enumerate(kernel) if k), torch.zeros(1))
 
 
 def cubic_weights(fraction: Tensor) -> Tensor:
     """Return weights [4, N] of the pixels -1, 0, 1, 2 for a position between 0 and 1 (Catmull-Rom)."""
     t = fraction
-    return xp.stack([((2 - t) * t - 1) * t, (3 * t - 5) * t**2 + 2, ((4 - 3 * t) * t + 1) * t, (t - 1) * t**2]) / 2
+    return torch.stack([((2 - t) * t - 1) * t, (3 * t - 5) * t**2 + 2, ((4 - 3 * t) * t + 1) * t, (t - 1) * t**2]) / 2
 
 
 def sample_cubic(image: Tensor, position: Tensor, size: int) -> Tensor:
     """Return bicubic patches [size, size, N] with upper left corners at real positions [2, N]."""
-    floor = xp.floor(position)
-    square = gather(image, whole(floor) - 1, size + 3)
+    floor = torch.floor(position)
+    square = gather(image, floor.long() - 1, size + 3)
     y = cubic_weights(position[0] - floor[0])
     x = cubic_weights(position[1] - floor[1])
-    zero = zeros(1)
+    zero = torch.zeros(1)
     rows = sum((y[k] * square[k : k + size] for k in range(4)), zero)
     return sum((x[k] * rows[:, k : k + size] for k in range(4)), zero)
 
 
 def sample_linear(image: Tensor, position: Tensor, size: int) -> Tensor:
     """Return bilinear patches [size, size, N] with upper left corners at real positions [2, N]."""
-    floor = xp.floor(position)
-    square = gather(image, whole(floor), size + 1)
+    floor = torch.floor(position)
+    square = gather(image, floor.long(), size + 1)
     y, x = position - floor
-    rows = mixed(square[:-1], square[1:], y)
-    return mixed(rows[:, :-1], rows[:, 1:], x)
+    rows = torch.lerp(square[:-1], square[1:], y)
+    return torch.lerp(rows[:, :-1], rows[:, 1:], x)
 
 
 def inside(shape: tuple[int, ...], position: Tensor, size: int) -> Tensor:
     """Return which pixels of patches at real positions [2, N] lie in the image: bool [size, size, N]."""
-    at = position[:, None] + xp.arange(size)[:, None]
+    at = position[:, None] + torch.arange(size)[:, None]
     y, x = ((at[k] >= 0) & (at[k] <= shape[k] - 1) for k in (0, 1))
     return y[:, None] & x[None]
 
@@ -153,31 +150,31 @@ def lucas_kanade(reference: Tensor, other: Tensor, corner: Tensor, shift: Tensor
     template = gather(reference, corner, size)
     flats = derivatives(other)
     slopes = [gather(image, corner, size) for image in derivatives(reference)]
-    shift = single(shift)
-    moving = xp.ones(corner.shape[1:], dtype=xp.bool)
+    shift = shift.float()
+    moving = torch.ones(corner.shape[1:], dtype=torch.bool)
     for _ in range(ITERATIONS):
-        position = single(corner + shift)
+        position = (corner + shift).float()
         valid = inside(other.shape, position, size)
         error = (template - sample_cubic(other, position, size)) * valid
         gy, gx = ((s + sample_cubic(f, position, size)) / 2 * valid for s, f in zip(slopes, flats, strict=True))
         yy, xy, xx, ye, xe = ((a * b).sum((0, 1)) for a, b in ((gy, gy), (gy, gx), (gx, gx), (gy, error), (gx, error)))
         det = yy * xx - xy**2
         moving = moving & (det > 1e-6 * (yy + xx) ** 2) & (det > 1e-12)
-        step = xp.stack([xx * ye - xy * xe, yy * xe - xy * ye]) / xp.where(moving, det, 1.0)
-        step = step / xp.clip(xp.sqrt(xp.square(step).sum(0)), 1.0, None)
-        shift = xp.where(moving, shift + step, shift)
+        step = torch.stack([xx * ye - xy * xe, yy * xe - xy * ye]) / torch.where(moving, det, 1.0)
+        step = step / torch.clip(torch.sqrt(torch.square(step).sum(0)), 1.0, None)
+        shift = torch.where(moving, shift + step, shift)
     return shift
 
 
 def candidates(parent: Tensor, down: int, across: int, fine: Level, coarse: Level) -> list[Tensor]:
     """Return integer shifts [2, N] for the patches of the finer level from their parent and two of its neighbours."""
-    scaled = whole(xp.round(parent * coarse.ratio))
+    scaled = torch.round(parent * coarse.ratio).long()
 
     def parents(count: int, limit: int) -> tuple[Tensor, Tensor]:
-        place = xp.arange(count) * fine.stride / (coarse.ratio * coarse.patch)
-        first = xp.clip(whole(xp.floor(place)), None, limit - 1)
+        place = torch.arange(count) * fine.stride / (coarse.ratio * coarse.patch)
+        first = torch.clip(torch.floor(place).long(), None, limit - 1)
         onward = ((place - first >= 0.5) & (first + 1 < limit)) | (first == 0)
-        return first, xp.clip(xp.where(onward, first + 1, first - 1), 0, limit - 1)
+        return first, torch.clip(torch.where(onward, first + 1, first - 1), 0, limit - 1)
 
     y, other_y = parents(down, parent.shape[1])
     x, other_x = parents(across, parent.shape[2])
@@ -186,23 +183,23 @@ def candidates(parent: Tensor, down: int, across: int, fine: Level, coarse: Leve
 
 def align(reference: list[Tensor], other: list[Tensor], *, refine_finest: bool = False) -> Tensor:
     """Return shifts [2, N] of the finest level's patches between two pyramids; integers (as floats) unless refined."""
-    shifts = zeros(2, 1, 1)
+    shifts = torch.zeros(2, 1, 1)
     for depth in range(len(LEVELS) - 1, -1, -1):
         level = LEVELS[depth]
         image = reference[depth]
         corner, down, across = grid(image.shape, level)
         patches = gather(image, corner, level.patch)
         if depth == len(LEVELS) - 1:
-            starts = [xp.zeros_like(corner)]
+            starts = [torch.zeros_like(corner)]
         else:
             starts = candidates(shifts, down, across, level, LEVELS[depth + 1])
         found, least = search(patches, other[depth], corner, starts[0], level.radius)
         for start in starts[1:]:
             shift, cost = search(patches, other[depth], corner, start, level.radius)
             better = cost < least - TIE * level.patch**2
-            found = xp.where(better, shift, found)
-            least = xp.where(better, cost, least)
-        fine = single(found)
+            found = torch.where(better, shift, found)
+            least = torch.where(better, cost, least)
+        fine = found.float()
         if level.refine or (depth == 0 and refine_finest):
             fine = lucas_kanade(image, other[depth], corner, fine, level.patch)
         shifts = fine.reshape(2, down, across)

@@ -24,20 +24,19 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from functools import partial
+from typing import Literal
 
 import numpy as np
+import torch
 from numpy import ndarray as Array
+from torch import Tensor
 
 from qsim.sensor.estimation import Response
 from qsim.sensor.sensor import Sensor
 from quiver.baselines import bm3d, patch_alignment
-from quiver.baselines.arrays import add_at, mixed, single, whole, xp, zeros
 from quiver.baselines.sliding_window import check_window, checked_codes, in_units, look_ahead
 from quiver.baselines.vst import stabiliser
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -98,6 +97,10 @@ def restore(
     return in_units(restored, photons_per_unit)
 
 
+restore_denoised = partial(restore, excess=EXCESS)
+restore_as_published = partial(restore, settings=AS_PUBLISHED)
+
+
 def merge(codes: Array, frame: int, table: Response, window: int, settings: Settings = CALIBRATED) -> Array:
     """Return the mean code [H, W], float32, of the window around one frame after alignment and Wiener merging."""
     check_window(window)
@@ -108,7 +111,7 @@ def merge(codes: Array, frame: int, table: Response, window: int, settings: Sett
     present = codes[here.start : here.stop]
     unit = _unit(present, table)
     stack = present.astype(np.float32) / unit
-    frames = xp.stack([patch_alignment.pad_image(image) for image in single(stack)])
+    frames = torch.stack([patch_alignment.pad_image(image) for image in torch.from_numpy(stack)])
     places = range(start - here.start, start - here.start + window)
     shifts = frame_shifts(frames, places, settings)
     blocks = [slice(block.start, block.stop) for block in _blocks(len(frames), places, settings.block)]
@@ -150,13 +153,13 @@ def frame_shifts(frames: Tensor, window: range, settings: Settings = CALIBRATED)
     middle = window[len(window) // 2]
     pyramids = [patch_alignment.pyramid(frames[span.start : span.stop].mean(0)) for span in found]
     own = next(i for i, span in enumerate(found) if middle in span)
-    still = zeros(*patch_alignment.grid(frames.shape[1:], patch_alignment.LEVELS[0])[0].shape)
+    still = torch.zeros(*patch_alignment.grid(frames.shape[1:], patch_alignment.LEVELS[0])[0].shape)
     moves = [
         still if i == own else patch_alignment.align(pyramids[own], other, refine_finest=settings.refine_finest)
         for i, other in enumerate(pyramids)
     ]
-    times = single([(span.start + span.stop - 1) / 2 for span in found])
-    shifts = _interpolate(single(xp.arange(len(frames))) - times[own], times - times[own], xp.stack(moves))
+    times = torch.tensor([(span.start + span.stop - 1) / 2 for span in found])
+    shifts = _interpolate(torch.arange(len(frames)).float() - times[own], times - times[own], torch.stack(moves))
     return shifts - shifts[middle]
 
 
@@ -186,19 +189,19 @@ def _interpolate(place: Tensor, known: Tensor, values: Tensor) -> Tensor:
     beyond, and at the speed of the other side where one side has none.
     """
     if len(known) == 1:
-        return xp.broadcast_to(values, (len(place), *values.shape[1:]))
+        return torch.broadcast_to(values, (len(place), *values.shape[1:]))
     if known[0] == 0:
-        known = xp.concat([-known[1:2], known])
-        values = xp.concat([-values[1:2], values])
+        known = torch.concat([-known[1:2], known])
+        values = torch.concat([-values[1:2], values])
     elif known[-1] == 0:
-        known = xp.concat([known, -known[-2:-1]])
-        values = xp.concat([values, -values[-2:-1]])
-    within = xp.clip(place, float(known[0]), float(known[-1]))
-    right = xp.clip(xp.searchsorted(known, within), 1, len(known) - 1)
+        known = torch.concat([known, -known[-2:-1]])
+        values = torch.concat([values, -values[-2:-1]])
+    within = torch.clip(place, float(known[0]), float(known[-1]))
+    right = torch.clip(torch.searchsorted(known, within), 1, len(known) - 1)
     share = (within - known[right - 1]) / (known[right] - known[right - 1])
-    beyond = place / xp.where(within == 0, 1.0, within)
-    between = mixed(values[right - 1], values[right], share[:, None, None])
-    return between * xp.where(within == 0, 1.0, beyond)[:, None, None]
+    beyond = place / torch.where(within == 0, 1.0, within)
+    between = torch.lerp(values[right - 1], values[right], share[:, None, None])
+    return between * torch.where(within == 0, 1.0, beyond)[:, None, None]
 
 
 def _warp_block(frames: Tensor, shifts: Tensor, corner: Tensor, smooth: bool) -> Tensor:
@@ -207,19 +210,19 @@ def _warp_block(frames: Tensor, shifts: Tensor, corner: Tensor, smooth: bool) ->
     Pixels from outside the image are left out; where no frame has any, the border repeats.
     """
     size = patch_alignment.LEVELS[0].patch
-    total, count, edge = zeros(3, size, size, corner.shape[1])
+    total, count, edge = torch.zeros(3, size, size, corner.shape[1])
     for image, shift in zip(frames, shifts, strict=True):
-        position = single(corner + (shift if smooth else xp.round(shift)))
+        position = (corner + (shift if smooth else torch.round(shift))).float()
         patch = (
             patch_alignment.sample_linear(image, position, size)
             if smooth
-            else patch_alignment.gather(image, whole(position), size)
+            else patch_alignment.gather(image, position.long(), size)
         )
         valid = patch_alignment.inside(image.shape, position, size)
         total = total + patch * valid
         count = count + valid
         edge = edge + patch
-    return xp.where(count > 0, total / xp.clip(count, 1, None), edge / len(frames))
+    return torch.where(count > 0, total / torch.clip(count, 1, None), edge / len(frames))
 
 
 def _merge_patches(
@@ -236,18 +239,18 @@ def _merge_patches(
     smooth = settings.refine_finest
     reference = _warp_block(*blocks[middle], corner, smooth)
     noise = size * size * settings.wiener * _noise(reference, own, table, unit, settings)
-    spectrum = xp.fft.rfft2(reference, None, (0, 1))
+    spectrum = torch.fft.rfft2(reference, None, (0, 1))
     total = own * spectrum
     for i, (count, block) in enumerate(zip(counts, blocks, strict=True)):
         if i == middle:
             continue
-        other = xp.fft.rfft2(_warp_block(*block, corner, smooth), None, (0, 1))
+        other = torch.fft.rfft2(_warp_block(*block, corner, smooth), None, (0, 1))
         other -= spectrum
-        power = xp.square(other.real) + xp.square(other.imag)
+        power = torch.square(other.real) + torch.square(other.imag)
         both = noise * (1 + own / count)  # of the difference
         total += count * (spectrum + other * (both / (power + both)))  # A F0 + (1 - A) Fz, A = power / (power + both)
-    patches = xp.fft.irfft2(total / sum(counts), (size, size), (0, 1))
-    return xp.clip(overlap_add(patches, corner, shape), 0, None)
+    patches = torch.fft.irfft2(total / sum(counts), (size, size), (0, 1))
+    return torch.clip(overlap_add(patches, corner, shape), 0, None)
 
 
 def _noise(reference: Tensor, frames: int, table: Response, unit: float, settings: Settings) -> Tensor:
@@ -257,21 +260,21 @@ def _noise(reference: Tensor, frames: int, table: Response, unit: float, setting
     size = len(reference)
     if settings.wiener_variance == "patch":
         spread = reference - reference.mean((0, 1))
-        return xp.clip(xp.square(spread).sum((0, 1)) / (size**2 - 1), EPSILON, None)
+        return torch.clip(torch.square(spread).sum((0, 1)) / (size**2 - 1), EPSILON, None)
     mean_code = np.asarray(unit * reference.mean((0, 1)))
     variance = np.interp(mean_code, table.mean, table.variance) / (frames * unit**2)
-    return single(np.maximum(variance, EPSILON))
+    return torch.asarray(np.maximum(variance, EPSILON), dtype=torch.float32)
 
 
 def overlap_add(patches: Tensor, corner: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return an image of this shape: the mean of overlapping patches [size, size, N], weighted by a raised cosine."""
     size = patches.shape[0]
     width = shape[1]
-    step = xp.arange(size)
-    one = 0.5 - 0.5 * xp.cos(2 * xp.pi * (single(step) + 0.5) / size)
-    weight = xp.outer(one, one)[..., None]
+    step = torch.arange(size)
+    one = 0.5 - 0.5 * torch.cos(2 * torch.pi * (step.float() + 0.5) / size)
+    weight = torch.outer(one, one)[..., None]
     index = ((corner[0] + step[:, None]) * width)[:, None] + (corner[1] + step[:, None])[None]
-    above, below = zeros(2, shape[0] * width)
-    add_at(above, index.reshape(-1), (patches * weight).reshape(-1))
-    add_at(below, index.reshape(-1), xp.broadcast_to(weight, patches.shape).reshape(-1))
+    above, below = torch.zeros(2, shape[0] * width)
+    above.index_add_(0, index.reshape(-1), (patches * weight).reshape(-1))
+    below.index_add_(0, index.reshape(-1), torch.broadcast_to(weight, patches.shape).reshape(-1))
     return (above / below).reshape(tuple(shape))

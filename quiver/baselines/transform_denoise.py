@@ -11,6 +11,8 @@ times: the deviation and the inverse are those of such a mean.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy import ndarray as Array
 
@@ -48,3 +50,6 @@ def restore(
             clean = bm3d.denoise(table[total], transform.deviation, peak=transform.peak)
             restored[frame - frames.start] = transform.inverse(clean)
     return in_units(restored, photons_per_unit)
+
+
+restore_as_published = partial(restore, kind="binomial")

@@ -36,7 +36,7 @@ class ComparisonRow:
     precision: str = RestoreOptions.precision
     cut: str = ""  # tiles of a frame where they change the answer, else empty
     device: str = "cpu"  # where it was restored
-    threads: int | None = None  # of torch; None: without torch
+    threads: int | None = None  # of torch; None where nothing was restored
 
     @property
     def key(self) -> tuple[str, str, str, str, str, str]:

@@ -54,7 +54,7 @@ class SummaryLine:
     seconds_per_frame: float  # NaN where devices or threads differ
     peak_bytes: int | None  # of memory, largest over clips; None where devices or threads differ
     devices: tuple[str, ...]  # where the clips were restored
-    threads: tuple[int | None, ...]  # of torch; None: without torch
+    threads: tuple[int | None, ...]  # of torch
     above_peak: float  # share of target pixels above the peak, largest over clips
     truth_psnr: float | None  # dB, mean over clips
     near_truth: tuple[str, ...]  # PSNR scores within metrics.NEAR_TRUTH of that of the truth, in some clip
@@ -221,7 +221,7 @@ def _mixed(lines: Sequence[SummaryLine]) -> list[str]:
     for line in lines:
         if max(len(line.devices), len(line.threads)) > 1:
             devices = ", ".join(line.devices)
-            threads = ", ".join(str(count or "without torch") for count in line.threads)
+            threads = ", ".join(str(count) for count in line.threads)
             told.append(f"{line.method}, {line.light} (devices: {devices}; threads: {threads})")
     return [f"No time and memory, because not all clips were restored alike: {'; '.join(told)}.", ""] if told else []
 

@@ -13,7 +13,7 @@ from quiver.data.clips import Clip
 from quiver.data.codes import Codes, LazyArray, Sensor, Stream, array_codes, filled, open_stream, sensed, stream_codes
 from quiver.data.defects import check_map
 from quiver.data.illumination import Illumination, is_known
-from quiver.restoration.automatic import MISSING, chosen
+from quiver.restoration.automatic import chosen
 from quiver.restoration.domain_remarks import refuse_outside, remarks
 from quiver.restoration.interface import AUTO, DEFAULT_METHOD, RestoreOptions
 from quiver.restoration.restored_file import check_finite
@@ -54,11 +54,9 @@ def restore(
         raise ValueError(f"method= is a name, a weights file or a run folder as text, got {method!r}")
     bad = None if defects is None else check_map(np.asarray(defects), "defects=")
     codes = filled(_codes(source, sensor, exposure, ppp), bad)
-    runner, why = chosen(method, codes, RestoreOptions(device=device or "auto", mode=mode or "exact"))
+    runner, _ = chosen(method, codes, RestoreOptions(device=device or "auto", mode=mode or "exact"))
     refuse_idle({"device": device, "mode": mode, "method": method}, [runner])
     found = remarks([runner], codes)
-    if why is not None and MISSING in why:
-        found.append(why)
     if strict:
         refuse_outside([runner], found, "strict=", named=method != AUTO)
     if codes.not_inverted:

@@ -19,8 +19,6 @@ from quiver.restoration.mosaics import by_colour
 from quiver.restoration.restorers import restorer
 
 NETWORK = "mergenet"
-WITHOUT = "qbp-bm3d"  # without the packages of networks
-MISSING = "needs the package"
 
 
 def chosen(name: str, codes: Codes, options: RestoreOptions | None = None) -> tuple[Restorer, str | None]:
@@ -63,10 +61,7 @@ def _best(codes: Codes, known: dict[str, Restorer], options: RestoreOptions | No
                 f"the codes have different exposures, and {codes.sensor.bits} bit are too many for likelihood",
             )
         return "likelihood", "the codes have different exposures"
-    try:
-        network = known.get(NETWORK) or known.setdefault(NETWORK, restorer(NETWORK, options))
-    except ModuleNotFoundError as error:
-        return WITHOUT, f"{NETWORK} {MISSING} {error.name}"
+    network = known.get(NETWORK) or known.setdefault(NETWORK, restorer(NETWORK, options))
     domain = None if network.scope is None else network.scope.domain
     measured = ""
     unknown = ""

@@ -505,15 +505,20 @@ def test_an_engine_that_does_not_exist(folder, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("package", "line"), [("av", "qsim preview lit -o x.mp4"), ("zarr", "qsim convert lit x.zarr")]
+    ("package", "line"),
+    [
+        ("av", "qsim preview lit -o x.mp4"),
+        ("zarr", "qsim convert lit x.zarr"),
+        ("torch", "quiver restore lit -o x.npy --ppp 3.25 --method naive"),
+    ],
 )
 def test_a_package_that_is_not_installed(folder, monkeypatch, capsys, package, line):
     real = builtins.__import__
 
-    def without(name: str, *rest: object) -> object:
+    def without(name: str, *rest: object, **more: object) -> object:
         if name.split(".")[0] == package:
             raise ModuleNotFoundError(f"No module named {package!r}", name=package)
-        return real(name, *rest)
+        return real(name, *rest, **more)
 
     monkeypatch.chdir(folder)
     monkeypatch.setattr(builtins, "__import__", without)

@@ -8,8 +8,6 @@ import pytest
 import quiver
 from qsim.sensor import devices
 from quiver.cli.program import main
-from quiver.restoration import automatic
-from quiver.restoration.restorers import restorer
 
 
 @pytest.mark.filterwarnings("ignore:mergenet ")  # measured or not for such streams
@@ -57,16 +55,3 @@ def test_a_path_of_a_bare_array_says_what_to_give(tmp_path):
     np.save(tmp_path / "a.npy", np.ones((3, 8, 8), np.uint8))
     with pytest.raises(ValueError, match="a bare array; give numpy"):
         quiver.restore(tmp_path / "a.npy")
-
-
-def test_a_missing_package_is_told_where_auto_avoids_it(inputs, monkeypatch):
-    """A weaker method was taken without a word."""
-
-    def missing(name, options=None):
-        if name == automatic.NETWORK:
-            raise ModuleNotFoundError("No module named 'torch'", name="torch")
-        return restorer("moment", options)
-
-    monkeypatch.setattr(automatic, "restorer", missing)
-    with pytest.warns(UserWarning, match="auto: qbp-bm3d; mergenet needs the package torch"):
-        quiver.restore(inputs["stream"])
