@@ -2,7 +2,7 @@
 
 Counted are convolutions, linear layers and matrix products, as torch counts them; sampling and arithmetic on single
 pixels are not. The count of a design is that of one more frame of a long clip. What restoring a stream in parts adds,
-the frames around each part, depends on the program (quiver/restoration/parts.py); `quiver bench` counts it.
+the frames around each part, depends on the program (quiver/restoration/pieces.py); `quiver bench` counts it.
 """
 
 from functools import cache

@@ -19,8 +19,7 @@ from quiver.data.codes import Codes, frame_reader, light_of
 from quiver.data.noise import noise_table
 from quiver.device import moved, pick_device
 from quiver.restoration.interface import RestoreOptions, Restorer
-from quiver.restoration.parts import part_of, takes_clips
-from quiver.restoration.pieces import Disagreement, cut_pieces, told_of_cut
+from quiver.restoration.pieces import Disagreement, cut_pieces, part_of, takes_clips, told_of_cut
 
 if TYPE_CHECKING:
     from torch import Tensor, nn

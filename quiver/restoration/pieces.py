@@ -1,9 +1,18 @@
-"""Decides how much of a frame a network computes at a time, within the memory bound and with the same result.
+"""Decides how much of a clip a network computes at a time, within the memory bound: frames, and tiles of a frame.
 
-A U-Net has a reach of 36 px: tiles that overlap by twice as much give the result of the complete frame. The attention
-and the gates of QUIVER average over the frame, and its recurrence reaches far: it takes the complete frame. A frame
-too large for that is cut into tiles that are blended, and so is a frame too large for a compared network. Their result
-differs: a warning states by how much.
+    frames before | part | frames after  ->  network  ->  the part; the rest is thrown away
+    cores that cover the frame, each grown by `reach` on its inner sides  ->  tiles that are computed
+
+Parts begin at multiples of their length, so that a frame is restored alike whether a range of frames or the complete
+stream is requested, and memory does not grow with the stream. Where a network restores one frame of a window, the
+frames around a part are those of its windows, and the result is that of the complete clip. Recurrent networks are
+limited: they see the past, and without a fixed look-ahead the future, only as far as their part.
+
+A U-Net has a reach of 36 px: tiles that overlap by twice as much give the result of the complete frame. Tiles begin at
+multiples of the network's stride, so that pooling uses the same cells; of all cuts whose tiles fit, the one with the
+smallest total area is taken. The attention and the gates of QUIVER average over the frame, and its recurrence reaches
+far: it takes the complete frame. A frame too large for that is cut into tiles that are blended, and so is a frame too
+large for a compared network. Their result differs: a warning states by how much.
 """
 
 from __future__ import annotations
@@ -16,17 +25,137 @@ import numpy as np
 from numpy import ndarray as Array
 
 from quiver.data.codes import Codes
-from quiver.restoration.parts import part_of, takes_clips
-from quiver.tiles import Tile, cut_tiles
 
 if TYPE_CHECKING:
     from torch import nn
 
+PAST = 10  # frames before a part, where a network sees the complete past: as many as in training
+AROUND = 4  # frames before and after a part, where a network sees the complete clip
+KEPT = 16  # frames of a part, where a network restores one frame of a window
+KEPT_OF_CLIP = 8  # where it sees the complete clip: with AROUND, sixteen frames at a time
+KEPT_OF_RECURRENT = 32  # ten frames computed again are a third more work; with 16 they are two thirds
 BLENDED = 32  # px: half of the overlap of neighbouring tiles where no overlap makes them exact
 TILING = 30_000_000  # bytes that tiles of several shapes take beyond those of the largest; 26 MB measured
 STEP = 16  # px: tiles of the compared networks begin at multiples of it
 MERGED_BYTES = 1_500  # per pixel that merging and MergeNet take
 COUNTS = 0.1  # weight from which the result of a tile is compared with its neighbours
+
+
+# ---- Parts of a clip
+
+
+@dataclass(frozen=True)
+class ClipPart:
+    """The frames that are restored at a time, and those around them."""
+
+    before: int
+    kept: int
+    after: int
+    past: int  # most frames before a restored one that it depends on
+    future: int  # most frames after it
+
+    @property
+    def seen(self) -> int:
+        """Frames that the network has at a time."""
+        return self.before + self.kept + self.after
+
+
+def takes_clips(network: nn.Module) -> bool:
+    """Return whether a network restores every frame of a clip: the compared networks do, and state a look-ahead."""
+    return hasattr(network, "look_ahead")
+
+
+def part_of(network: Any) -> ClipPart:
+    """Return the parts in which a network restores a clip."""
+    ahead = network.look_ahead
+    if ahead is None:
+        around, kept = getattr(network, "parts", (AROUND, KEPT_OF_CLIP))
+        return ClipPart(around, kept, around, around + kept - 1, around + kept - 1)
+    if hasattr(network, "frames_in"):
+        before = network.frames_in - 1 - ahead
+        return ClipPart(before, KEPT, ahead, before, ahead)
+    return ClipPart(PAST, KEPT_OF_RECURRENT, ahead, PAST + KEPT_OF_RECURRENT - 1, ahead)
+
+
+# ---- Tiles of a frame
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A part of the frame and the weight of its result, [h, w]; the weights of all tiles sum to 1 at every pixel."""
+
+    y: int
+    x: int
+    weight: Array
+
+
+def extents(length: int, core: int, reach: int) -> list[tuple[int, int]]:
+    """Return first and last + 1 pixel of each span: `core` pixels of `length`, grown by `reach` on both sides."""
+    return [(max(0, start - reach), min(length, start + core + reach)) for start in range(0, length, core)]
+
+
+def cores(height: int, width: int, pixels: int, reach: int, multiple: int, least: int = 1) -> tuple[int, int]:
+    """Return height and width of the cores whose tiles hold at most `pixels` pixels and have the smallest total area.
+
+    `multiple` divides reach and cores. A side below `least` counts as `least`: the network fills it. `ValueError` if
+    the smallest tile does not fit.
+    """
+    if max(height, least) * max(width, least) <= pixels:
+        return height, width
+    found = []
+    for length in (height, width):
+        tried = np.arange(multiple, length + multiple, multiple)
+        ends = [extents(length, int(core), reach) for core in tried]
+        found.append(
+            (tried, *(np.array([kind(max(b - a, least) for a, b in spans) for spans in ends]) for kind in (max, sum)))
+        )
+    (tall, most_y, all_y), (wide, most_x, all_x) = found
+    area = np.where(most_y[:, None] * most_x <= pixels, all_y[:, None] * all_x, np.iinfo(np.int64).max)
+    y, x = np.unravel_index(np.argmin(area), area.shape)
+    if most_y[y] * most_x[x] > pixels:
+        raise ValueError(
+            f"the memory bound holds {pixels} pixels at a time; a tile needs at least {most_y.min()} x {most_x.min()}; "
+            "raise --memory"
+        )
+    return int(tall[y]), int(wide[x])
+
+
+def spans(length: int, core: int, reach: int, blend: bool) -> list[tuple[int, Array]]:
+    """Return starts and weights [n] of spans that cover `length`; the weights sum to 1.
+
+    A weight is 1 in the core and 0 beyond; with `blend` it rises and falls linearly over the overlap.
+    """
+    shapes = []
+    total = np.zeros(length)
+    for start, (first, last) in zip(range(0, length, core), extents(length, core, reach), strict=True):
+        at = np.arange(first, last)
+        shape = ((at >= start) & (at < start + core)).astype(float)
+        if blend:
+            rise = (at - start + reach + 1) / (2 * reach + 1) if start else np.ones(len(at))
+            fall = (start + core + reach - at) / (2 * reach + 1) if start + core < length else np.ones(len(at))
+            shape = np.clip(rise, 0, 1) * np.clip(fall, 0, 1)
+        shapes.append((first, shape))
+        total[first:last] += shape
+    return [(first, (shape / total[first : first + len(shape)]).astype(np.float32)) for first, shape in shapes]
+
+
+def cut_tiles(
+    height: int, width: int, pixels: int, reach: int, multiple: int = 1, *, blend: bool = False, least: int = 1
+) -> list[Tile]:
+    """Return tiles of at most `pixels` pixels that start at multiples of `multiple`; one tile if the frame fits.
+
+    A side below `least` counts as `least`. `ValueError` if the smallest tile does not fit.
+    """
+    reach = -(-reach // multiple) * multiple
+    tall, wide = cores(height, width, pixels, reach, multiple, least)
+    return [
+        Tile(y, x, rows[:, None] * columns[None, :])
+        for y, rows in spans(height, tall, reach, blend)
+        for x, columns in spans(width, wide, reach, blend)
+    ]
+
+
+# ---- The cut of a frame for a network and a memory
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from quiver.model.rivals.edges import reflected
 from quiver.model.weights import save
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import network_restorer, wrap_network
-from quiver.restoration.parts import part_of, takes_clips
+from quiver.restoration.pieces import part_of, takes_clips
 
 CLIPS = [name for name in EVERY if takes_clips(tiny(name))]
 

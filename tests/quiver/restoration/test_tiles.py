@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quiver.tiles import cores, cut_tiles, extents, spans
+from quiver.restoration.pieces import cores, cut_tiles, extents, spans
 
 
 @pytest.mark.parametrize("blend", [False, True])
