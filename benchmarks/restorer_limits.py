@@ -28,7 +28,7 @@ from quiver.data.codes import Codes, array_codes, filled
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
 from quiver.model.weights import digest
-from quiver.restoration.domain_remarks import light_change
+from quiver.restoration.domain import light_change
 from quiver.restoration.restorers import restorer, weights_path
 
 ROOT = Path(__file__).parents[1]
@@ -297,7 +297,7 @@ def page(found: dict[str, Any]) -> str:
         "## Light that changes",
         "",
         f"3 bits; the light rises steadily over {FRAMES} frames. The gain is over {RIVAL}. The change that is "
-        "found in the codes alone leaves out what noise may explain (quiver/restoration/domain_remarks.py).",
+        "found in the codes alone leaves out what noise may explain (quiver/restoration/domain.py).",
         "",
     ]
     rows = [(k, told(v["gain"], 2), f"{100 * np.mean(v['found']):.0f} %") for k, v in found["changing"].items()]

@@ -48,7 +48,7 @@ def add_domain(sub: Any) -> None:
 def _run_domain(args: argparse.Namespace) -> int:
     from quiver import threads
     from quiver.model.weights import load, metadata_of
-    from quiver.restoration.domain import TIE, Domain, read_scope, table
+    from quiver.restoration.domain import TIE, Domain, forget_damaged, read_scope, table
     from quiver.restoration.networks import network_restorer
     from quiver.restoration.restorers import weights_path
     from quiver.restoration.sources import refuse, refuse_idle
@@ -58,7 +58,7 @@ def _run_domain(args: argparse.Namespace) -> int:
 
     path = weights_path(args.weights)
     if args.clips:
-        from quiver.evaluation.domain_measurement import forget_damaged, measure
+        from quiver.evaluation.domain_measurement import measure
 
         threads.check(args.threads)
         options = running_options(args)

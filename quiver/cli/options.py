@@ -121,7 +121,7 @@ def check_domain(
 
     Of many lines only the first `shown` are printed, and how many follow.
     """
-    from quiver.restoration.domain_remarks import measured_at, refuse_outside, remarks
+    from quiver.restoration.interface import measured_at, refuse_outside, remarks
 
     found: list[str] = []
     for codes in streams:

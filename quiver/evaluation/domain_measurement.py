@@ -26,15 +26,24 @@ from quiver.data.noise import file_digests
 from quiver.evaluation import metrics
 from quiver.evaluation.comparison import in_memory
 from quiver.model.weights import annotate, metadata_of
-from quiver.restoration.domain import KEY, Cell, Domain, merged, place_of, read_scope
+from quiver.restoration.domain import (
+    CUT,
+    KEY,
+    METHODS_ARE,
+    SENSOR,
+    Cell,
+    Domain,
+    changes,
+    merged,
+    place_of,
+    read_scope,
+    stored,
+)
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 from quiver.restoration.restorers import restorers
 
 CLASSICAL = ("naive", "moment:3", "transform-denoise", "qbp", "qbp-bm3d")
-SENSOR = "sensor file "  # + its name: the key of its SHA-256
-METHODS_ARE = "what the methods do"  # key of their descriptions, which change when results do
-CUT = "tiles of a frame"  # key of those that change results
 
 
 @dataclass(frozen=True)
@@ -93,11 +102,11 @@ def measure(
     shared = settings.to_dict() | {METHODS_ARE: [method.description for method in methods]}
     shared |= _run_of(network, settings.clips) | _sensor_files(settings.lights)
     before = read_scope(weights, metadata_of(weights)).domain
-    if before is not None and (changes := _changes(before.measured, shared)) and not force:
-        changed = ", ".join(changes)
+    changed = [] if before is None else changes(before.measured, shared)
+    if before is not None and changed and not force:
         raise ValueError(
-            f"{weights}: holds {len(before.cells)} cells that were measured otherwise (not the same: {changed}); "
-            "measure into a copy of the file, or use --force to replace them"
+            f"{weights}: holds {len(before.cells)} cells that were measured otherwise (not the same: "
+            f"{', '.join(changed)}); measure into a copy of the file, or use --force to replace them"
         )
     todo = [light for light in settings.lights if force or not _known(weights, shared, light)]
     for done, light in enumerate(todo):
@@ -112,22 +121,6 @@ def measure(
     if progress is not None:
         progress(len(todo), max(1, len(todo)))
     return stored(weights, shared)
-
-
-def forget_damaged(weights: Path) -> None:
-    """Remove the cells of a weights file whose domain is damaged, so that it can be measured again."""
-    try:
-        read_scope(weights, metadata_of(weights))
-    except ValueError:
-        annotate(weights, {KEY: None})
-
-
-def stored(weights: Path, shared: Mapping[str, object]) -> Domain:
-    """Return the cells in a weights file that were measured with these settings, and the settings of all of them."""
-    domain = read_scope(weights, metadata_of(weights)).domain
-    if domain is None or _changes(domain.measured, shared):
-        return Domain((), shared)
-    return Domain(domain.cells, {**domain.measured, **shared})
 
 
 def _run_of(network: Restorer, clips: Sequence[Clip]) -> dict[str, object]:
@@ -146,18 +139,6 @@ def _sensor_files(lights: Sequence[Illumination]) -> dict[str, object]:
         if found.setdefault(name, digest) != digest:
             raise ValueError(f"{sensor}: another sensor file has the same name, by which cells are stored; rename one")
     return found
-
-
-def _changes(measured: Mapping[str, object], shared: Mapping[str, object]) -> list[str]:
-    """Return the settings that differ. Sensor files, tiles and descriptions of methods that only one side states are no
-    difference.
-    """
-    one_sided = {key for key in measured.keys() ^ shared.keys() if key.startswith((SENSOR, CUT, METHODS_ARE))}
-    return [
-        key
-        for key in dict.fromkeys((*shared, *measured))
-        if key not in one_sided and measured.get(key) != shared.get(key)
-    ]
 
 
 def _known(weights: Path, shared: Mapping[str, object], light: Illumination) -> bool:

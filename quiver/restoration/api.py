@@ -14,8 +14,7 @@ from quiver.data.codes import Codes, LazyArray, Sensor, Stream, array_codes, fil
 from quiver.data.defects import check_map
 from quiver.data.illumination import Illumination, is_known
 from quiver.restoration.automatic import chosen
-from quiver.restoration.domain_remarks import refuse_outside, remarks
-from quiver.restoration.interface import AUTO, DEFAULT_METHOD, RestoreOptions
+from quiver.restoration.interface import AUTO, DEFAULT_METHOD, RestoreOptions, refuse_outside, remarks
 from quiver.restoration.restored_file import check_finite
 from quiver.restoration.sources import codes_of, refuse_idle
 

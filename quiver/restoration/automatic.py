@@ -11,9 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from quiver.baselines import exposures
-from quiver.data.codes import Codes
+from quiver.data.codes import Codes, light_of
 from quiver.restoration.domain import place_of
-from quiver.restoration.domain_remarks import light_of
 from quiver.restoration.interface import AUTO, RestoreOptions, Restorer
 from quiver.restoration.mosaics import by_colour
 from quiver.restoration.restorers import restorer

@@ -1,4 +1,6 @@
-"""Describes what a network was measured for: cells of sensor, bits and light, its PSNR and the best rival's.
+"""Describes what a network was measured for, and writes remarks where it restores something else.
+
+A measurement has cells of sensor, bits and light, with the PSNR of the network and of the best rival.
 
     weights file --`quiver domain`--> cells in its metadata;   stream, cells --`remark`--> nothing, or one line
 
@@ -12,13 +14,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import numpy as np
+from msgspec import Meta
+from numpy import ndarray as Array
+
+from qsim import records
+from qsim.kinds import Bits, Number, Positive, Text
 from qsim.tables import markdown_table
-from quiver.data.codes import Sensor
+from quiver.data.codes import DARKEST, Codes, Sensor, light_of
 from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise
 
@@ -26,18 +34,35 @@ FORMAT = "quiver-domain-1"
 KEY = "domain"  # of the metadata of a weights file
 TIE = 0.05  # dB; differences of single clips scatter so that the mean of three has a standard error of 0.4 to 0.9
 NEAR = 1.25  # light and gain within this factor of the measured ones count as equal
-MAX_CELLS = 10_000
 UP_TO_A_FACTOR = "restored light is right up to a factor, as the published program learns grey / 255"
+SENSOR = "sensor file "  # + its name: the key of its SHA-256
+METHODS_ARE = "what the methods do"  # key of their descriptions, which change when results do
+CUT = "tiles of a frame"  # key of those that change results
+
+DARK = 0.1  # dark counts over the events of the mean light, above which a stream is unlike all cells
+CHANGE = 0.08  # of the light within eleven frames, above which a stream is unlike all cells: they reach 0.05
+# of the shortest stream that is like them, of more bits and of one: restorer_limits.md
+FRAMES = 4
+BINARY_FRAMES = 11
+LOOKED_AT = 11  # frames in the middle of the stream, in which a change of light is looked for
+SIDE = 16  # px of a square, less where the picture is small
+FEWEST = 9  # squares, below which the answer is 0
+CERTAIN = 6.0  # standard errors that a change exceeds: motion makes neighbouring squares alike
+MEDIAN = 1.2533  # standard error of a median over that of a mean, of normal numbers
+DEVIATION = 1.4826  # standard deviation over the median distance from the median, of normal numbers
+
+
+# ---- Cells
 
 
 @dataclass(frozen=True)
 class OperatingPoint:
     """The quantities of a stream that decide how informative its codes are."""
 
-    model: str  # of the sensor: QIS, BinarySPAD, CountingSPAD
-    bits: int
-    light: float  # detected photons per pixel and code
-    white: float  # detected photons at the top code
+    model: Text  # of the sensor: QIS, BinarySPAD, CountingSPAD
+    bits: Bits
+    light: Positive  # detected photons per pixel and code
+    white: Positive  # detected photons at the top code
 
     def like(self, other: OperatingPoint) -> bool:
         """Return whether kind, bits and gain agree; the gain either in photons, or in units of the light."""
@@ -51,12 +76,12 @@ class OperatingPoint:
 class Cell:
     """One measurement: matched PSNR [dB], mean over clips."""
 
-    sensor: str  # used in the measurement
-    ppp: float
+    sensor: Text  # used in the measurement
+    ppp: Positive
     place: OperatingPoint
-    network: float
-    classical: str  # the best classical method
-    classical_psnr: float
+    network: Number
+    classical: Text  # the best classical method
+    classical_psnr: Number
 
     @property
     def wins(self) -> bool:
@@ -110,32 +135,45 @@ class Domain:
         """Return the inverse of `to_json`; strict, `ValueError`."""
         try:
             found = json.loads(text)
-            if not isinstance(found, dict) or found.get("format") != FORMAT or not isinstance(found["measured"], dict):
-                raise ValueError(f"its format is not {FORMAT!r}")
-            if not isinstance(found["cells"], list) or not 0 < len(found["cells"]) <= MAX_CELLS:
-                raise ValueError(f"it holds 1 to {MAX_CELLS} cells")
-            return cls(tuple(_cell(values) for values in found["cells"]), found["measured"])
-        except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-            raise ValueError(f"{type(error).__name__}: {' '.join(str(error).split())}"[:200]) from None
+        except RecursionError:
+            raise ValueError("it is nested too deeply") from None
+        stored = records.convert(found, _Stored, KEY)
+        return cls(stored.cells, stored.measured)
 
 
-def _cell(values: Mapping[str, Any]) -> Cell:
-    cell = Cell(**{**values, "place": OperatingPoint(**values["place"])})
-    kinds: dict[str, tuple[type, ...]] = {
-        "str": (str,),
-        "int": (int,),
-        "float": (int, float),
-        "OperatingPoint": (OperatingPoint,),
-    }
-    for part in (cell, cell.place):
-        for field in fields(part):
-            value = getattr(part, field.name)
-            good = isinstance(value, kinds[str(field.type)]) and not isinstance(value, bool)
-            if not good or (isinstance(value, int | float) and not math.isfinite(value)):
-                raise ValueError(f"{field.name} = {repr(value)[:60]} is not valid")
-    if not (cell.place.bits >= 1 and min(cell.ppp, cell.place.light, cell.place.white) > 0):
-        raise ValueError(f"a cell of {cell.place.bits} bit at {cell.ppp!r} photons is not valid")
-    return cell
+@dataclass(frozen=True)
+class _Stored:
+    """A domain as the metadata of a weights file hold it."""
+
+    format: Literal["quiver-domain-1"]
+    measured: dict[str, Any]
+    cells: Annotated[tuple[Cell, ...], Meta(min_length=1, max_length=10_000)]
+
+
+def place_of(sensor: Sensor, exposure: float, ppp: float) -> OperatingPoint:
+    """Return where codes of a sensor lie that receives `ppp` photons per pixel and exposure [s]."""
+    efficiency = sensor.efficiency
+    return OperatingPoint(type(sensor).__name__, sensor.bits, ppp * efficiency, sensor.white(exposure) * efficiency)
+
+
+def table(domain: Domain) -> list[str]:
+    """Return the cells as a Markdown table, the winner of each in bold."""
+    rows = []
+    for cell in domain.cells:
+        ours = f"{cell.network:.2f}"
+        theirs = f"{cell.classical_psnr:.2f}"
+        ours, theirs = (f"**{ours}**", theirs) if cell.wins else (ours, f"**{theirs}**")
+        rows.append((cell.sensor, str(cell.place.bits), f"{cell.ppp:g}", ours, f"{cell.classical} {theirs}"))
+    return markdown_table(rows, ("sensor", "bits", "PPP", "network", "best classical method"))
+
+
+def merged(old: Iterable[Cell], new: Iterable[Cell]) -> tuple[Cell, ...]:
+    """Return cells by sensor, bits and light; a new one replaces an old one."""
+    found = {(cell.sensor, cell.place.bits, cell.ppp): cell for cell in (*old, *new)}
+    return tuple(found[key] for key in sorted(found))
+
+
+# ---- The weights file
 
 
 @dataclass(frozen=True)
@@ -179,24 +217,156 @@ def _listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
-def place_of(sensor: Sensor, exposure: float, ppp: float) -> OperatingPoint:
-    """Return where codes of a sensor lie that receives `ppp` photons per pixel and exposure [s]."""
-    efficiency = sensor.efficiency
-    return OperatingPoint(type(sensor).__name__, sensor.bits, ppp * efficiency, sensor.white(exposure) * efficiency)
+def forget_damaged(weights: Path) -> None:
+    """Remove the cells of a weights file whose domain is damaged, so that it can be measured again."""
+    from quiver.model.weights import annotate, metadata_of
+
+    try:
+        read_scope(weights, metadata_of(weights))
+    except ValueError:
+        annotate(weights, {KEY: None})
 
 
-def table(domain: Domain) -> list[str]:
-    """Return the cells as a Markdown table, the winner of each in bold."""
-    rows = []
-    for cell in domain.cells:
-        ours = f"{cell.network:.2f}"
-        theirs = f"{cell.classical_psnr:.2f}"
-        ours, theirs = (f"**{ours}**", theirs) if cell.wins else (ours, f"**{theirs}**")
-        rows.append((cell.sensor, str(cell.place.bits), f"{cell.ppp:g}", ours, f"{cell.classical} {theirs}"))
-    return markdown_table(rows, ("sensor", "bits", "PPP", "network", "best classical method"))
+def stored(weights: Path, shared: Mapping[str, object]) -> Domain:
+    """Return the cells in a weights file that were measured with these settings, and the settings of all of them."""
+    from quiver.model.weights import metadata_of
+
+    domain = read_scope(weights, metadata_of(weights)).domain
+    if domain is None or changes(domain.measured, shared):
+        return Domain((), shared)
+    return Domain(domain.cells, {**domain.measured, **shared})
 
 
-def merged(old: Iterable[Cell], new: Iterable[Cell]) -> tuple[Cell, ...]:
-    """Return cells by sensor, bits and light; a new one replaces an old one."""
-    found = {(cell.sensor, cell.place.bits, cell.ppp): cell for cell in (*old, *new)}
-    return tuple(found[key] for key in sorted(found))
+def changes(measured: Mapping[str, object], shared: Mapping[str, object]) -> list[str]:
+    """Return the settings that differ. Sensor files, tiles and descriptions of methods that only one side states are no
+    difference.
+    """
+    one_sided = {key for key in measured.keys() ^ shared.keys() if key.startswith((SENSOR, CUT, METHODS_ARE))}
+    return [
+        key
+        for key in dict.fromkeys((*shared, *measured))
+        if key not in one_sided and measured.get(key) != shared.get(key)
+    ]
+
+
+# ---- Remarks
+
+
+def remark(name: str, scope: Scope, codes: Codes) -> str | None:
+    """Return one line where a network is outside of what it was measured for; None inside."""
+    ppp = light_of(codes)
+    if ppp <= DARKEST * codes.white:
+        return f"{name} was never measured in such darkness: the codes tell no light"
+    place = place_of(codes.sensor, codes.exposure, ppp)
+    stream = f"{codes.sensor_name or place.model}, {place.bits} bit, {ppp:.3g} PPP"
+    if scope.domain is None:
+        return _unmeasured(name, scope.trained, codes, place, stream)
+    cell = scope.domain.nearest(place)
+    if cell is None:
+        best = scope.domain.best_classical
+        text = f"{name} was never measured near {stream}; where it was, {best} is mostly the best classical method"
+        dark = _dark_share(codes, ppp)
+        return text if dark <= DARK else f"{text}; {_dark_text(dark)}, and dark places may become too bright"
+    if not cell.wins:
+        return f"{name} is worse than {cell.classical} on {stream}: {cell.scores} at {cell.name}"
+    return _unlike_cells(name, codes, ppp)
+
+
+def _unlike_cells(name: str, codes: Codes, ppp: float) -> str | None:
+    """Return the remark on a stream whose dark counts, changes of light or frames are unlike those of all cells."""
+    dark = _dark_share(codes, ppp)
+    if dark > DARK:
+        return (
+            f"{name} was never measured where {_dark_text(dark)}, and makes dark places too bright there; "
+            "compare with qbp-bm3d"
+        )
+    change = light_change(codes)
+    if change > CHANGE:
+        return (
+            f"{name} was never trained on light that changes, here by at least {100 * change:.0f} % within eleven "
+            "frames; compare with qbp-bm3d"
+        )
+    return _too_short(name, codes.shape[0], codes.sensor.bits)
+
+
+def _too_short(name: str, frames: int, bits: int) -> str | None:
+    """Return the remark on a stream of few frames: by how much a flat field was wrong, at 0.3 to 3.25 PPP."""
+    if frames >= (BINARY_FRAMES if bits == 1 else FRAMES):
+        return None
+    stream = "one frame" if frames == 1 else f"{frames} frames"
+    off = 30 if frames == 1 else 12 if bits == 1 else 5
+    return f"{name} was never trained on {stream} of {bits} bit, and its brightness may be wrong by up to {off} %"
+
+
+def _dark_share(codes: Codes, ppp: float) -> float:
+    """Return the dark counts over the events of the mean light [photons]."""
+    return codes.sensor.dark_rate * codes.exposure / (ppp * codes.sensor.efficiency)
+
+
+def _dark_text(share: float) -> str:
+    return f"dark counts are {100 * share:.0f} % of the mean light"
+
+
+def _unmeasured(name: str, trained: Sequence[Illumination], codes: Codes, place: OperatingPoint, stream: str) -> str:
+    """Return the remark on weights without cells: what they were trained on, and whether the stream is like that."""
+    start = f"{name} was never measured against the classical methods"
+    if not trained:
+        return f"{start}, and its file does not state what it was trained on; this stream is {stream}"
+    words = ", ".join(dict.fromkeys(light.sensor for light in trained))
+    depths = ", ".join(str(bits) for bits in sorted({light.bits for light in trained if light.bits is not None}))
+    levels = ", ".join(f"{ppp:g}" for ppp in sorted({light.ppp for light in trained if light.ppp is not None}))
+    if any(_same(light, codes, place) for light in trained):
+        return f"{start}; it was trained on such streams ({stream})"
+    return f"{start}; it was trained on {words}, {depths or 'own'} bit, {levels or 'own'} PPP, this stream is {stream}"
+
+
+def _same(light: Illumination, codes: Codes, place: OperatingPoint) -> bool:
+    """Return whether a stream lies where training was."""
+    if light.ppp is None:
+        return False
+    try:
+        seen = place_of(light.device(codes.exposure), codes.exposure, light.ppp)
+    except (ValueError, OSError):  # the sensor's file is missing
+        return False
+    return seen.like(place) and abs(math.log(seen.light / place.light)) <= math.log(NEAR)
+
+
+# ---- Light that changes
+
+
+def light_change(codes: Codes) -> float:
+    """Return the least change of light, largest minus smallest over the mean, that noise and motion do not explain.
+
+    Light that changes brightens all squares of a picture alike. Things that move brighten some and darken others, so
+    that the median over squares stays; the mean does not: it changes by up to 23 % in scenes of constant light.
+    0 for constant light, and where the codes do not tell: few squares, darkness, saturation, different exposures.
+    """
+    length, height, width = codes.shape
+    side = max(4, min(SIDE, height // 6, width // 6))
+    rows = height // side
+    columns = width // side
+    if rows * columns < 2 * FEWEST or length < 2 or codes.shares is not None:
+        return 0.0
+    first = max(0, (length - LOOKED_AT) // 2)
+    frames = codes.read(first, min(length, first + LOOKED_AT))[:, : rows * side, : columns * side]
+    means = frames.reshape(len(frames), rows, side, columns, side).mean(axis=(2, 4)).reshape(len(frames), -1)
+    try:
+        light = codes.sensor.response(codes.exposure).invert(means, side * side)
+    except ValueError:
+        return 0.0
+    return _change(np.asarray(light, float))
+
+
+def _change(light: Array) -> float:
+    """Return the change of the light [T, squares], from the brighter half of the squares."""
+    mean = light.mean(axis=0)
+    bright = light[:, (mean >= np.median(mean)) & (mean > 0)]
+    if bright.shape[1] < FEWEST:
+        return 0.0
+    ratios = bright / bright.mean(axis=0)
+    factors = np.median(ratios, axis=1)
+    spread = DEVIATION * np.median(np.abs(ratios - factors[:, None]), axis=1)
+    errors = MEDIAN * spread / np.sqrt(bright.shape[1])
+    low = int(factors.argmin())
+    high = int(factors.argmax())
+    return float(max(0.0, factors[high] - factors[low] - CERTAIN * np.hypot(errors[low], errors[high])))

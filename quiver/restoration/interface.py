@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.files import Progress
-from quiver.data.codes import Codes
+from quiver.data.codes import Codes, light_of
 from quiver.device import HOST_MEMORY, default_memory, pick_device
-from quiver.restoration.domain import Scope
-from quiver.restoration.mosaics import fill_mosaic
+from quiver.restoration.domain import UP_TO_A_FACTOR, Scope, place_of, remark
+from quiver.restoration.mosaics import by_colour, fill_mosaic
 
 AUTO = "auto"  # chooses the method of a stream: see automatic.py
 DEFAULT_METHOD = AUTO  # of `quiver restore` and `quiver.restore`
@@ -99,3 +99,63 @@ class Restorer:
             self.fill(codes, out, first, progress)
         else:
             fill_mosaic(self.fill, codes, out, first, progress)
+
+
+# ---- What is said of methods on a stream
+
+
+def remarks(methods: Iterable[Restorer], codes: Codes) -> list[str]:
+    """Return the remarks on all networks among the methods."""
+    return [text for method in methods for text in _remarks(method, codes)]
+
+
+def _remarks(method: Restorer, codes: Codes) -> list[str]:
+    """Return the different remarks on a method, of a mosaic on the light of each colour, which is restored alone.
+
+    None for a classical one, and where there is nothing to say.
+    """
+    if method.scope is None:
+        return []
+    said = [remark(method.name, method.scope, part) or _run_unlike(method) for part in by_colour(codes)]
+    if method.scope.relative:
+        said = [f"{text or f'{method.name} was converted'}; {UP_TO_A_FACTOR}" for text in said]
+    return list(dict.fromkeys(text for text in said if text is not None))
+
+
+def _run_unlike(method: Restorer) -> str | None:
+    """Return the remark on a network that runs otherwise than when it was measured: in mode or precision."""
+    if method.scope is None or method.scope.domain is None:
+        return None
+    usual = {"mode": RestoreOptions.mode, "precision": RestoreOptions.precision}
+    now = [str(method.identity.get(key) or value) for key, value in usual.items()]
+    then = [str(method.scope.domain.measured.get(key) or value) for key, value in usual.items()]
+    if now == then:
+        return None
+    return (
+        f"{method.name} was measured in {' and '.join(then)}, and runs in {' and '.join(now)}: nothing tells how well"
+    )
+
+
+def measured_at(method: Restorer, codes: Codes) -> str | None:
+    """Return the measurement that is nearest to a stream, as a line for --verbose; None where there is none.
+
+    Of a mosaic it is that of every colour.
+    """
+    if method.scope is None or method.scope.domain is None:
+        return None
+    places = [place_of(part.sensor, part.exposure, light_of(part)) for part in by_colour(codes)]
+    cells = [cell for place in places if (cell := method.scope.domain.nearest(place)) is not None]
+    told = dict.fromkeys(f"{cell.name}: {cell.scores}" for cell in cells)
+    return f"{method.name} was measured at {'; '.join(told)}" if told else None
+
+
+def refuse_outside(methods: Sequence[Restorer], found: Sequence[str], option: str, *, named: bool = True) -> None:
+    """Raise `ValueError` for `strict`, the name of whose option is given: with the first remark, or without a network.
+
+    Methods that were not `named` are the choice of `auto`: a classical one is no mistake.
+    """
+    if named and not any(method.learned for method in methods):
+        names = ", ".join(method.name for method in methods)
+        raise ValueError(f"{option}: acts on networks, and {names} is classical; leave it out")
+    if found:
+        raise ValueError(f"{found[0]}; leave out {option} to run it nevertheless")

@@ -13,7 +13,7 @@ from domains import MEASURED, cell, stream, tensors_digest, weights
 from qsim.sensor import devices
 from quiver.model.unet import UNet
 from quiver.model.weights import annotate, load, metadata_of
-from quiver.restoration import domain, domain_remarks
+from quiver.restoration import domain
 from quiver.restoration.domain import Domain, OperatingPoint
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import network_restorer
@@ -110,10 +110,10 @@ def test_the_shipped_weights_know_their_domain():
     lost = replace(scope, domain=replace(scope.domain, cells=tuple(replace(one, network=0.0) for one in cells)))
     for one in cells:
         source = stream(ppp=one.ppp, bits=one.place.bits)
-        said = domain_remarks.remark("mergenet", scope, source)
+        said = domain.remark("mergenet", scope, source)
         assert said is None if one.wins else f"mergenet is worse than {one.classical} on {one.name}" in said
-        assert f"mergenet is worse than {one.classical}" in domain_remarks.remark("mergenet", lost, source)
-    assert "never measured near" in str(domain_remarks.remark("mergenet", scope, stream(bits=4)))
+        assert f"mergenet is worse than {one.classical}" in domain.remark("mergenet", lost, source)
+    assert "never measured near" in str(domain.remark("mergenet", scope, stream(bits=4)))
 
 
 def test_places_of_one_gain_are_alike():

@@ -25,7 +25,7 @@ from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise
 from quiver.model.published_weights import convert_weights
 from quiver.model.weights import annotate, metadata_of
-from quiver.restoration import domain, domain_remarks
+from quiver.restoration import domain, interface
 from quiver.restoration.domain import Domain, Scope
 from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer
@@ -33,16 +33,16 @@ from quiver.restoration.restorers import restorer
 
 def test_inside_nothing_is_said_and_outside_the_better_method():
     scope = Scope(MEASURED)
-    assert domain_remarks.remark("mine", scope, stream()) is None
-    assert domain_remarks.remark("mine", scope, stream(ppp=4.0)) is None
-    dim = domain_remarks.remark("mine", scope, stream(ppp=1.2))
+    assert domain.remark("mine", scope, stream()) is None
+    assert domain.remark("mine", scope, stream(ppp=4.0)) is None
+    dim = domain.remark("mine", scope, stream(ppp=1.2))
     assert dim == (
         "mine is worse than qbp-bm3d on quiver-physical, 3 bit, 1.2 PPP: qbp-bm3d 20.0 dB, network 15.0 dB "
         "at quiver-physical, 3 bit, 1 PPP"
     )
     others = (stream(bits=1), stream("quiver-published", 1.0), stream("spad512s", 1))
     for far in (stream(ppp=0.5), stream(ppp=100.0), *others):
-        said = domain_remarks.remark("mine", scope, far)
+        said = domain.remark("mine", scope, far)
         assert said is not None
         assert "was never measured near" in said
         assert "qbp-bm3d is mostly the best classical method" in said
@@ -55,35 +55,33 @@ def test_light_that_is_not_told_is_estimated():
     assert untold.ppp is None
     assert light_of(told) == 3.25
     assert light_of(untold) == pytest.approx(3.25, rel=0.1)
-    assert domain_remarks.remark("mine", Scope(MEASURED), untold) is None
-    assert "is worse than" in str(domain_remarks.remark("mine", Scope(MEASURED), stream(ppp=26.0, told=False)))
+    assert domain.remark("mine", Scope(MEASURED), untold) is None
+    assert "is worse than" in str(domain.remark("mine", Scope(MEASURED), stream(ppp=26.0, told=False)))
 
 
 def test_weights_without_cells_say_what_they_were_trained_on(tmp_path):
     path = weights(tmp_path, settings={"sensor": "quiver-physical", "bits": [1, 3], "ppp": [3.25, 9.75]})
     scope = domain.read_scope(path, metadata_of(path))
     assert scope.trained == tuple(Illumination("quiver-physical", p, b) for b in (1, 3) for p in (3.25, 9.75))
-    same = domain_remarks.remark("mine", scope, stream())
-    other = domain_remarks.remark("mine", scope, stream("spad512s", 2, 1))
+    same = domain.remark("mine", scope, stream())
+    other = domain.remark("mine", scope, stream("spad512s", 2, 1))
     assert same == (
         "mine was never measured against the classical methods; it was trained on such streams "
         "(quiver-physical, 3 bit, 3.25 PPP)"
     )
     assert "it was trained on quiver-physical, 1, 3 bit, 3.25, 9.75 PPP, this stream is spad512s, 1 bit" in str(other)
-    assert "does not state what it was trained on" in str(domain_remarks.remark("old", Scope(), stream()))
+    assert "does not state what it was trained on" in str(domain.remark("old", Scope(), stream()))
     own = Noise("mine.toml", 2.0, 1, record=json.dumps(devices.load("spad512s", bits=1).to_dict()), lux=None)
     path = weights(tmp_path, settings={"sensor": None, "noise": [own.to_dict(), Noise().to_dict()]})
     scope = domain.read_scope(path, metadata_of(path))
     assert [light.sensor for light in scope.trained] == ["mine.toml", "quiver-physical"]
-    assert "trained on such streams" in str(domain_remarks.remark("mine", scope, stream("spad512s", 2, 1)))
-    assert "trained on such streams" in str(domain_remarks.remark("mine", scope, stream()))
-    assert "this stream is" in str(domain_remarks.remark("mine", scope, stream(bits=2)))
+    assert "trained on such streams" in str(domain.remark("mine", scope, stream("spad512s", 2, 1)))
+    assert "trained on such streams" in str(domain.remark("mine", scope, stream()))
+    assert "this stream is" in str(domain.remark("mine", scope, stream(bits=2)))
     several = {"sensor": ["quiver-physical", "none.toml"], "bits": [3], "ppp": [1]}
     path = weights(tmp_path, settings=several)
     assert len(domain.read_scope(path, metadata_of(path)).trained) == 2
-    assert "none.toml" in str(
-        domain_remarks.remark("m", domain.read_scope(path, metadata_of(path)), stream("spad512s", 2, 1))
-    )
+    assert "none.toml" in str(domain.remark("m", domain.read_scope(path, metadata_of(path)), stream("spad512s", 2, 1)))
 
 
 def test_restore_warns_in_one_line_and_refuses_with_strict(capsys, tiny_dataset, tmp_path):
@@ -178,9 +176,7 @@ def test_another_mode_or_precision_than_that_of_the_cells_is_told():
 
 
 def said_of(found: Domain, identity: dict[str, object], codes: Codes) -> list[str]:
-    return domain_remarks.remarks(
-        [Restorer("mine", 11, 5, True, "", nothing, identity=identity, scope=Scope(found))], codes
-    )
+    return interface.remarks([Restorer("mine", 11, 5, True, "", nothing, identity=identity, scope=Scope(found))], codes)
 
 
 def nothing(codes: Codes, out: np.ndarray, first: int, progress: object) -> None: ...
@@ -218,13 +214,13 @@ def test_converted_weights_have_light_up_to_a_factor(tmp_path):
     torch.save(published_state(), source)
     convert_weights(source, path)
     clause = "restored light is right up to a factor, as the published program learns grey / 255"
-    (text,) = domain_remarks.remarks([restorer(str(path))], stream())
+    (text,) = interface.remarks([restorer(str(path))], stream())
     assert text.startswith("small was never measured against the classical methods")
     assert text.endswith(f"; {clause}")
     annotate(path, {domain.KEY: MEASURED.to_json()})
-    assert domain_remarks.remarks([restorer(str(path))], stream()) == [f"small was converted; {clause}"]
+    assert interface.remarks([restorer(str(path))], stream()) == [f"small was converted; {clause}"]
     own = restorer(str(weights(tmp_path)))
-    assert "up to a factor" not in str(domain_remarks.remarks([own], stream()))
+    assert "up to a factor" not in str(interface.remarks([own], stream()))
 
 
 def test_darkness_is_told_without_a_number():
@@ -232,7 +228,7 @@ def test_darkness_is_told_without_a_number():
         np.zeros((5, 32, 32), np.uint8), devices.load("quiver-physical", ppp=3.25, bits=3, exposure=5e-4), 5e-4
     )
     for scope in (Scope(MEASURED), Scope()):
-        assert domain_remarks.remark("mine", scope, dark) == (
+        assert domain.remark("mine", scope, dark) == (
             "mine was never measured in such darkness: the codes tell no light"
         )
 
@@ -242,7 +238,7 @@ def test_light_that_changes_is_told():
     for change, said in ((0.0, False), (0.5, True)):
         light = 3.25 * (1 + change * np.linspace(-0.5, 0.5, 11))[:, None, None] * np.ones((1, 64, 64))
         codes = replace(array_codes(device.sample(light, 5e-4, key=Key(1, 1)), device, 5e-4), ppp=3.25)
-        text = str(domain_remarks.remark("mine", Scope(MEASURED), codes))
+        text = str(domain.remark("mine", Scope(MEASURED), codes))
         assert ("mine was never trained on light that changes, here by at least " in text) == said
 
 
@@ -250,26 +246,24 @@ def test_dark_counts_and_few_frames_are_told():
     """In the middle of the measured cells: the sensor makes a fifth of the light itself, or there are three frames."""
     scope = Scope(MEASURED)
     plain = stream()
-    assert domain_remarks.remark("mine", scope, plain) is None
+    assert domain.remark("mine", scope, plain) is None
     noisy = replace(plain, sensor=plain.sensor.with_dark_rate(0.2 * 3.25 * plain.sensor.efficiency / plain.exposure))
-    assert "never measured where dark counts are 20 % of the mean light" in str(
-        domain_remarks.remark("mine", scope, noisy)
-    )
-    far = str(domain_remarks.remark("mine", scope, stream("quiver-published", 1.0)))  # 1.6 dark electrons, 0.8 of light
+    assert "never measured where dark counts are 20 % of the mean light" in str(domain.remark("mine", scope, noisy))
+    far = str(domain.remark("mine", scope, stream("quiver-published", 1.0)))  # 1.6 dark electrons, 0.8 of light
     assert "was never measured near quiver-published, 3 bit, 1 PPP" in far
     assert far.endswith("dark counts are 200 % of the mean light, and dark places may become too bright")
-    assert "dark" not in str(domain_remarks.remark("mine", scope, stream(ppp=100.0)))
+    assert "dark" not in str(domain.remark("mine", scope, stream(ppp=100.0)))
     for frames, words in (
         (1, "one frame of 3 bit, and its brightness may be wrong by up to 30 %"),
         (3, "3 frames of 3"),
     ):
         few = replace(plain, shape=(frames, *plain.shape[1:]))
-        assert f"never trained on {words}" in str(domain_remarks.remark("mine", scope, few))
-    assert domain_remarks.remark("mine", scope, replace(plain, shape=(4, *plain.shape[1:]))) is None
+        assert f"never trained on {words}" in str(domain.remark("mine", scope, few))
+    assert domain.remark("mine", scope, replace(plain, shape=(4, *plain.shape[1:]))) is None
     binary = Scope(Domain((cell(1.0, 25.0, bits=1, sensor="spad-320x240"),), {}))
     for frames, words in ((1, "30 %"), (4, "12 %"), (10, "12 %"), (11, None)):
         few = stream("spad-320x240", 1.0, 1)
-        text = domain_remarks.remark("mine", binary, replace(few, shape=(frames, *few.shape[1:])))
+        text = domain.remark("mine", binary, replace(few, shape=(frames, *few.shape[1:])))
         assert text is None if words is None else text is not None and text.endswith(words)
 
 

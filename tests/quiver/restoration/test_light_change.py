@@ -11,7 +11,7 @@ from numpy import ndarray as Array
 from qsim.keys import Key
 from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
-from quiver.restoration.domain_remarks import light_change
+from quiver.restoration.domain import light_change
 
 LIGHTS = (
     ("quiver-physical", 1.0, 1),

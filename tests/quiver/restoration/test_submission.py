@@ -15,7 +15,7 @@ from PIL import Image
 from quiver.cli.program import main
 from quiver.data.challenge import cubes
 from quiver.data.codes import Codes
-from quiver.restoration import automatic, domain_remarks
+from quiver.restoration import automatic, interface
 from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer
 from quiver.restoration.submission import picture_psnr, restore_cubes, restore_last
@@ -142,7 +142,7 @@ def test_every_band_of_every_cube_decides(tmp_path, monkeypatch, capsys):
         patched.setattr(automatic, "chosen_for_all", chosen)
         assert main(words) == 0
     assert seen == [f"{scene}/000007 {colour}" for scene in ("day", "night") for colour in ("red", "green", "blue")]
-    monkeypatch.setattr(domain_remarks, "remark", remark)
+    monkeypatch.setattr(interface, "remark", remark)
     assert main([*words, "--force", "--method", "mergenet", "--strict"]) == 2
     assert "never measured so: night/000007 blue; leave out --strict" in capsys.readouterr().err
     unknown |= {"day/000007 red", "night/000007 red"}
