@@ -119,7 +119,10 @@ def good_pixels(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistic
         for _ in range(3):
             residual = level - smooth_part(basis, level, inside)
             spread = max(robust_sigma(residual[inside]), sqrt(np.median(flat.pixel_variance) / flat.frames), 1e-9)
-            inside = good.ravel() & (np.abs(residual) <= OUTLIER * spread)
+            near = good.ravel() & (np.abs(residual) <= OUTLIER * spread)
+            if 2 * near.sum() < good.sum():  # most codes are alike, and the others are no outliers of them
+                break
+            inside = near
         good &= inside.reshape(good.shape)
     return good
 

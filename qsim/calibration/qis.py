@@ -204,6 +204,11 @@ def _efficiency(fit: Fit, flats: Sequence[FrameStatistics], exposures: Sequence[
             excess = covariance[k, k] / max(fit.inverse[k, k], 1e-300)
             own[row] += share**2 * excess / max(fit.state.information[k, k], 1e-300)
         directions[row, DARK] = -exposures[darks + i] / max(exposures[:darks]) / photons
+    telling = own > 0  # a flat that is saturated throughout has no noise, and tells no light
+    if not telling.any():
+        return {}
+    directions = directions[telling]
+    own = own[telling]
     found = directions @ fit.state.parameters
     between = _between(found, own)
     weights = 1 / (own + between)
@@ -214,14 +219,14 @@ def _efficiency(fit: Fit, flats: Sequence[FrameStatistics], exposures: Sequence[
     low = interval.low
     high = interval.high
     method = "light standard, whose light is taken as exact"
-    if len(known) > 1:
-        freedom = len(known) - 1
+    if len(own) > 1:
+        freedom = len(own) - 1
         inner = float(weights**2 @ own)
         scatter = float(weights @ (found - value) ** 2) / freedom
         reach = student_quantile(0.975, freedom) ** 2 * scatter - Z95**2 * inner
         low = value - sqrt(max((value - low) ** 2 + reach, 0.0))
         high = value + sqrt(max((high - value) ** 2 + reach, 0.0))
-        method = f"light standard, with the scatter of {len(known)} flats"
+        method = f"light standard, with the scatter of {len(own)} flats"
     return {"quantum_efficiency": Value(value, max(low, 0.0), high, "e-/photon", method)}
 
 
