@@ -40,7 +40,7 @@ from quiver.training import merge_training
 from quiver.training.optimiser import Optimiser
 
 ROOT = Path(__file__).parents[1]
-FORMAT = "quiver-restorer-ablation-2"  # 1: frames merged as before commit 47251c1
+FORMAT = "quiver-restorer-ablation-2"
 SEEDS = (0, 1)
 PROTOCOL = merge_training.PROTOCOLS["quick"]
 TEST_LIGHTS = tuple(Illumination("quiver-physical", ppp, bits) for bits in (1, 3, 7) for ppp in (0.5, 3.25, 26.0))
