@@ -26,7 +26,6 @@ from qsim.colour import from_linear
 from qsim.files import decoding_errors, load_array
 from qsim.sensor import packing
 from qsim.sensor.colour_filter import MASKS
-from qsim.sensor.spad import BinarySPAD
 from qsim.streams.clip import Clip
 from qsim.streams.stream import Stream
 
@@ -77,7 +76,7 @@ def bands_of(clip: Clip, planes: int) -> list[Stream]:
     for band in bands:
         band.require_even("a cube of the challenge")
         single = band.bits == 1 and (band.meta.get("planes_per_code") or 1) == 1
-        if not (single and isinstance(band.sensor, BinarySPAD)) or band.shape != bands[0].shape:
+        if not (single and band.sensor.sums_planes) or band.shape != bands[0].shape:
             kind = type(band.sensor).__name__
             raise ValueError(
                 f"{band.path}: {band.bits}-bit codes {list(band.shape)} of a {kind}; the challenge has planes of one "

@@ -227,7 +227,7 @@ def to_stream(
         )
     capture = _as_stated(path, recording, capture)
     sensor, tables = _tables(capture, _sensor(recording, capture), height, width)
-    model = recording.code_model if isinstance(sensor, BinarySPAD) else sensor.code_model
+    model = recording.code_model if sensor.sums_planes else sensor.code_model
     npy.parent.mkdir(parents=True, exist_ok=True)
 
     def packed() -> Iterator[Array]:

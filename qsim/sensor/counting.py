@@ -45,6 +45,8 @@ class CountingSPAD(SPAD):
     paralyzable: bool = False
 
     code_model: ClassVar[str] = "counting"
+    takes_slices: ClassVar[bool] = True
+    follows_photons: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -52,6 +54,9 @@ class CountingSPAD(SPAD):
         require_size(self, "dead_time", SHORTEST, LONGEST)
         if not isinstance(self.paralyzable, bool):
             raise ValueError(f"CountingSPAD.paralyzable is true or false, got {self.paralyzable!r}")
+
+    def at_depth(self, bits: int) -> CountingSPAD:
+        return replace(self, bits=bits)
 
     def brightest(self, exposure: float) -> float:
         """Return the photons at which the mean count of a paralyzable pixel peaks; infinity for the other kind.

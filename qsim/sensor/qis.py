@@ -60,6 +60,8 @@ class QIS(Sensor):
     full_well: float | None = None  # e-
 
     code_model: ClassVar[str] = "multibit"
+    takes_slices: ClassVar[bool] = True
+    has_read_out: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         require_number(self, "quantum_efficiency", 0, 1, open_low=True)
@@ -81,8 +83,27 @@ class QIS(Sensor):
     def dark_rate(self) -> float:
         return self.dark_current
 
+    @property
+    def blur(self) -> float:
+        return self.read_noise
+
     def with_dark_rate(self, rate: float) -> QIS:
         return replace(self, dark_current=rate)
+
+    def law(self, *, summed: bool = False, disturbed: bool = False, read_out: bool = False) -> str:
+        return "process" if read_out or self.bits > _PROCESS_BITS else "table"
+
+    def at_depth(self, bits: int) -> QIS | None:
+        return replace(self, bits=bits) if (self.gain, self.offset) == (1.0, 0.0) else None
+
+    def without_read_noise(self) -> QIS:
+        return replace(self, read_noise=0.0)
+
+    def full_well_code(self, sigmas: float) -> int | None:
+        if self.full_well is None:
+            return None
+        electrons = max(self.full_well - sigmas * self.read_noise, self.full_well / 2)
+        return int(self.codes_of(np.array(electrons)))
 
     def white(self, exposure: float) -> float:
         """Return the photons at which x = 1: top code / (gain QE); offset, dark current and full well do not enter."""

@@ -9,11 +9,11 @@ states a plan for it. The reference draws the few pixels that float32 cannot dec
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from functools import cache, lru_cache
 from math import prod
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy import ndarray as Array
@@ -43,7 +43,57 @@ _UNITS = {
 
 
 class Sensor(Distribution):
-    """A pixel without memory. Subclasses are frozen dataclasses of their parameters."""
+    """A pixel without memory. Subclasses are frozen dataclasses of their parameters.
+
+    What a model can do is stated here, and overridden by the models that can: nobody else asks which model it is.
+    """
+
+    sums_planes: ClassVar[bool] = False  # a code is the sum of binary planes, each of which may have its own light
+    takes_slices: ClassVar[bool] = False  # light may change within one exposure
+    follows_photons: ClassVar[bool] = False  # its photons can be followed one by one: dead time links them
+    keeps_charge: ClassVar[bool] = False  # a plane depends on those before it
+    has_read_out: ClassVar[bool] = False  # electrons are read with gain, offset and noise
+
+    @property
+    def plane(self) -> Sensor:
+        """The sensor of one binary plane, where a code sums some; else this sensor."""
+        return self
+
+    @property
+    def gain(self) -> float:
+        """Codes per electron or avalanche."""
+        return 1.0
+
+    @property
+    def offset(self) -> float:
+        """The code of no electron."""
+        return 0.0
+
+    @property
+    def blur(self) -> float:
+        """Standard deviation of the noise of reading [electrons]."""
+        return 0.0
+
+    def law(self, *, summed: bool = False, disturbed: bool = False, read_out: bool = False) -> str:
+        """Return how codes are drawn from random numbers, `drawn_by` of a stream; another law draws other codes.
+
+        "table": one number against the cdf. "process": step by step, or the sum of all planes at once. "planes": one by
+        one. "closed form": counting pixels, by their cdf. "spikes": spike cameras, plane after plane. `summed` planes
+        have a clip frame each; pixels are `disturbed` by avalanches of others; some have their own `read_out`.
+        """
+        return "closed form"
+
+    def at_depth(self, bits: int) -> Sensor | None:
+        """Return the same pixel with codes of so many bits; None where other parameters belong to its bits."""
+        return None
+
+    def without_read_noise(self) -> Sensor:
+        """Return the same pixel, read without noise."""
+        return self
+
+    def full_well_code(self, sigmas: float) -> int | None:
+        """Return the code of the full well less so many sigmas of read noise, at least of half of it; None without."""
+        return None
 
     def __str__(self) -> str:
         """Return the parameters with their units; `repr` is the code that makes this sensor."""
@@ -110,6 +160,19 @@ class Sensor(Distribution):
         for t, frame in enumerate(photons):
             codes[t] = self._draw_frame(frame, exposure, key.at(key.frame + t), origin)
         return codes
+
+    def blocks(
+        self,
+        photons: Iterable[Array],
+        exposure: float,
+        key: Key,
+        origin: tuple[int, int] = (0, 0),
+        engine: str = "auto",
+    ) -> Iterator[Array]:
+        """Yield the codes [t, H, W] of successive blocks of photons [t, H, W], the first of frame key.frame."""
+        for block in photons:
+            yield self.sample(block, exposure, key=key, origin=origin, engine=engine)
+            key = key.at(key.frame + len(block)) if key.frame + len(block) < 2**32 else key
 
     def sample_packed(
         self, photons: Array, exposure: float, *, key: Key, origin: tuple[int, int] = (0, 0), engine: str = "auto"

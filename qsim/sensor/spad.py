@@ -69,11 +69,22 @@ class BinarySPAD(SPAD):
     bits: int = 1  # 1 ... 16
 
     code_model: ClassVar[str] = "binary_sum"
+    sums_planes: ClassVar[bool] = True
 
     @property
     def planes(self) -> int:
         """Return the number of binary planes in one code, M = 2^bits - 1."""
         return self.levels - 1
+
+    @property
+    def plane(self) -> BinarySPAD:
+        return replace(self, bits=1)
+
+    def at_depth(self, bits: int) -> BinarySPAD:
+        return replace(self, bits=bits)
+
+    def law(self, *, summed: bool = False, disturbed: bool = False, read_out: bool = False) -> str:
+        return "planes" if summed or disturbed or self.bits <= _PLANES_BITS else "process"
 
     @property
     def counters(self) -> int:

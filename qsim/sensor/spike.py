@@ -45,6 +45,7 @@ class SpikeCamera(Sensor):
     bits: int = 1
 
     code_model: ClassVar[str] = "spikes"
+    keeps_charge: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         require_number(self, "quantum_efficiency", 0, 1, open_low=True)
@@ -67,6 +68,9 @@ class SpikeCamera(Sensor):
     @property
     def dark_rate(self) -> float:
         return self.dark_current
+
+    def law(self, *, summed: bool = False, disturbed: bool = False, read_out: bool = False) -> str:
+        return "spikes"
 
     def with_dark_rate(self, rate: float) -> SpikeCamera:
         return replace(self, dark_current=rate)
@@ -127,6 +131,16 @@ class SpikeCamera(Sensor):
         require_counters(key, stack.shape, origin)
         spikes = np.concatenate(list(self.spikes([stack], exposure, key, origin)))
         return spikes if photons.ndim == 3 else spikes[0]
+
+    def blocks(
+        self,
+        photons: Iterable[Array],
+        exposure: float,
+        key: Key,
+        origin: tuple[int, int] = (0, 0),
+        engine: str = "auto",
+    ) -> Iterator[Array]:
+        return self.spikes(photons, exposure, key, origin)
 
     def spikes(
         self, blocks: Iterable[Array], exposure: float, key: Key, origin: tuple[int, int] = (0, 0)

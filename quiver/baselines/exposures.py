@@ -19,7 +19,6 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.sensor.estimation import pieces
-from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from quiver.baselines import few_codes
 from quiver.baselines.few_codes import levels, times_of
@@ -79,10 +78,8 @@ def _saturated(sensor: Sensor) -> int:
     Read noise is added behind the full well, so that saturated codes scatter around that of the full well. However
     strong it is, the lower half of the full well counts as light.
     """
-    if not isinstance(sensor, QIS) or sensor.full_well is None or sensor.bits <= FEW_BITS:
-        return sensor.levels - 1
-    electrons = max(sensor.full_well - SCATTER * sensor.read_noise, sensor.full_well / 2)
-    return int(sensor.codes_of(np.array(electrons)))
+    near = sensor.full_well_code(SCATTER) if sensor.bits > FEW_BITS else None
+    return sensor.levels - 1 if near is None else near
 
 
 def moment(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> Array:

@@ -26,8 +26,6 @@ from numpy import ndarray as Array
 
 from qsim.sensor.estimation import pieces
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD
-from qsim.sensor.spike import SpikeCamera
 
 MOST = 512  # outcomes that are solved for; of more, the second order leaves less than 0.1 %
 END = 0.3  # chance that all codes are the top one, up to which light the estimates are unbiased
@@ -55,7 +53,7 @@ def times_of(shares: Iterable[float]) -> Times:
 
 def counts_suffice(sensor: Sensor) -> bool:
     """Return whether the sum of codes of one exposure tells all that they tell: sums of binary samples, and one bit."""
-    return isinstance(sensor, BinarySPAD) or sensor.levels == 2
+    return sensor.sums_planes or sensor.levels == 2
 
 
 @lru_cache(maxsize=64)
@@ -65,7 +63,7 @@ def of_sums(sensor: Sensor, exposure: float, times: Times) -> Array:
     sums = np.arange(top * sum(count for _, count in times) + 1)
     light, mean, variance = _response(sensor, exposure, times)
     start = _plug_in(sums, light, mean)
-    if isinstance(sensor, SpikeCamera) or not _proportional(light, mean):
+    if sensor.keeps_charge or not _proportional(light, mean):
         found = start
     elif len(sums) <= MOST:
         light = _fitted_light(sensor, exposure, times)
@@ -82,7 +80,7 @@ def outcome_shape(sensor: Sensor, times: Times) -> tuple[int, ...] | None:
     It needs codes whose sums tell all that they tell, and at most MOST outcomes.
     """
     shape = tuple((sensor.levels - 1) * count + 1 for _, count in times)
-    known = counts_suffice(sensor) and not isinstance(sensor, SpikeCamera)
+    known = counts_suffice(sensor) and not sensor.keeps_charge
     return shape if known and np.prod(shape) <= MOST else None
 
 
@@ -148,7 +146,7 @@ def less_bias(likeliest: Array, sums: Array, sensor: Sensor, exposure: float, ti
     A window that is likeliest in the dark has the photons of its sum; none has more than a window of top codes only.
     """
     table = of_sums(sensor, exposure, times)
-    if isinstance(sensor, SpikeCamera):
+    if sensor.keeps_charge:
         return np.minimum(likeliest, table[-1])
     light, bias = second_order(sensor, exposure, times)
     found = np.where(likeliest > 0, likeliest - np.interp(likeliest, light, bias), table[sums])

@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from quiver.baselines.sliding_window import restore_by_sums
 
@@ -20,8 +19,7 @@ from quiver.baselines.sliding_window import restore_by_sums
 def dark_codes(sensor: Sensor, exposure: float) -> float:
     """Return the codes that a linear sensor would have in the dark."""
     slope = (sensor.levels - 1) / sensor.white(exposure)  # codes per photon
-    offset = sensor.offset if isinstance(sensor, QIS) else 0.0
-    return slope * sensor.dark_rate * exposure / sensor.efficiency + offset
+    return slope * sensor.dark_rate * exposure / sensor.efficiency + sensor.offset
 
 
 def restore(

@@ -27,7 +27,6 @@ from qsim.keys import Key
 from qsim.sensor.defects.defect_table import Defects as Defects
 from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.defects.good_pixels import behind, defective
-from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.streams.simulation import Draw
 from qsim.streams.stream import Stream
@@ -73,7 +72,7 @@ class Filler:
 
 def skips_codes(sensor: Sensor) -> bool:
     """Return whether codes between those of n and n + 1 electrons hardly ever occur: read noise does not reach them."""
-    return isinstance(sensor, QIS) and sensor.gain * (1 - 2 * REACH * sensor.read_noise) > 1
+    return sensor.gain * (1 - 2 * REACH * sensor.blur) > 1
 
 
 def of_draw(draw: Draw, exposure: float, shape: tuple[int, int]) -> Array | None:

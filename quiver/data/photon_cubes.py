@@ -10,7 +10,6 @@ from numpy import ndarray as Array
 
 from qsim.arrays import plain
 from qsim.files import load_array
-from qsim.sensor.spad import BinarySPAD
 from quiver.data.codes import Codes, array_codes, array_digest
 from quiver.data.illumination import Illumination
 
@@ -55,7 +54,7 @@ def _summed(path: Path, cube: Array, light: Illumination, frame_rate: float, pla
     if light.bits not in (None, bits):
         raise ValueError(f"{path}: sums of {planes} planes are {bits}-bit codes, got bits = {light.bits}; leave it out")
     sensor = replace(light, bits=bits).device(1 / frame_rate)
-    if planes > 1 and not isinstance(sensor, BinarySPAD):
+    if planes > 1 and not sensor.sums_planes:
         raise ValueError(
             f"{light.sensor}: only a clocked SPAD sums planes, this is a {type(sensor).__name__}; "
             "give another sensor, as in spad-320x240"

@@ -13,9 +13,6 @@ import numpy as np
 from torch.utils.data import Dataset
 
 from qsim.keys import Key
-from qsim.sensor.qis import QIS
-from qsim.sensor.spad import BinarySPAD
-from qsim.sensor.spike import SpikeCamera
 from qsim.streams.clip import Clip
 from quiver.data.codes import Codes, codes_of, light_of, open_stream, stream_codes
 from quiver.data.window_noise import WindowPlace
@@ -49,7 +46,7 @@ def law_of(codes: Codes) -> Law:
             "about one code per electron with little read noise, no offset and rare saturation"
         )
     dark = sensor.dark_rate * exposure / (sensor.efficiency * sensor.white(exposure))
-    return Law(isinstance(sensor, BinarySPAD), float(dark))
+    return Law(sensor.sums_planes, float(dark))
 
 
 def _no_counts(codes: Codes) -> str | None:
@@ -59,19 +56,18 @@ def _no_counts(codes: Codes) -> str | None:
         return "its codes are those of colour filters"
     if codes.shares is not None:
         return "its codes are those of different exposures"
-    if isinstance(sensor, SpikeCamera):
+    if sensor.keeps_charge:
         return "its codes are spikes of collected charge"
-    if isinstance(sensor, BinarySPAD):
+    if sensor.sums_planes:
         return None
-    if isinstance(sensor, QIS):
-        if not COUNTING[0] <= sensor.gain <= COUNTING[1]:
-            return f"its codes are {sensor.gain:.3g} per electron"
-        if abs(sensor.offset) > BLACK:
-            return f"its codes are shifted by an offset of {sensor.offset:.3g}"
-        if sensor.read_noise > BLUR:
-            return f"its codes are blurred by a read noise of {sensor.read_noise:.3g} electrons"
+    if not COUNTING[0] <= sensor.gain <= COUNTING[1]:
+        return f"its codes are {sensor.gain:.3g} per electron"
+    if abs(sensor.offset) > BLACK:
+        return f"its codes are shifted by an offset of {sensor.offset:.3g}"
+    if sensor.blur > BLUR:
+        return f"its codes are blurred by a read noise of {sensor.blur:.3g} electrons"
     light = light_of(codes)
-    counts = getattr(sensor, "gain", 1.0) * (sensor.efficiency * light + sensor.dark_rate * codes.exposure)
+    counts = sensor.gain * (sensor.efficiency * light + sensor.dark_rate * codes.exposure)
     lost = 1 - float(sensor.mean(np.array([light]), codes.exposure)[0]) / counts
     if lost > LOST:
         return f"its codes lose {100 * lost:.0f} % of the events of the mean light to saturation, dead time or rounding"

@@ -75,7 +75,7 @@ def _sensor(
     section: Section, sensor: str, bits: list[int | None], group: bool, slices: int, temperature: float | None
 ) -> str:
     """Return the sensor's name or absolute file; `ValueError` if it lacks these bits, or cannot be read as asked."""
-    from qsim.sensor import QIS, BinarySPAD, CountingSPAD, devices
+    from qsim.sensor import devices
     from qsim.sensor.file_laws import Conditions
 
     if sensor.endswith(".toml"):
@@ -84,10 +84,10 @@ def _sensor(
         with section.naming("sensor"):
             found = devices.load(sensor, ppp=3.25, bits=depth, exposure=5e-4, conditions=Conditions(temperature))
         known = depth is not None or sensor.endswith(".toml")
-        if group and not (known and isinstance(found, BinarySPAD)):
+        if group and not (known and found.sums_planes):
             what = f"this is a {type(found).__name__}" if known else "the bits of a code are needed, as in bits = 3"
             raise ValueError(f"{section.where('group')}: group sums planes of a clocked SPAD; {what}")
-        if slices > 1 and (group or not isinstance(found, QIS | CountingSPAD)):
+        if slices > 1 and (group or not found.takes_slices):
             what = "group sums planes instead" if group else f"this is a {type(found).__name__}"
             raise ValueError(f"{section.where('slices')}: slices are of one exposure of a QIS or CountingSPAD; {what}")
     return sensor

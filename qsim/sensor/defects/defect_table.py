@@ -77,6 +77,17 @@ class Defects:
             self.maps or self.crosstalk or self.afterpulse or self.carry_dead_time
         )
 
+    @property
+    def read_out(self) -> bool:
+        """Whether pixels have their own offset or read noise."""
+        own = {"offset_map", "read_noise_map"} & set(self.maps)
+        return bool(self.pattern.offset or self.pattern.read_noise or own)
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether avalanches of neighbours, or of the plane before, set off others."""
+        return bool(self.afterpulse or self.crosstalk)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the table as stored with a stream; measured maps with their checksums."""
         pattern = {key: getattr(self.pattern, key) for key in _PATTERN if getattr(self.pattern, key)}

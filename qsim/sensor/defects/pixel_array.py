@@ -16,7 +16,6 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.arrays import plain
 from qsim.keys import Key, require_counters
-from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.correlated_noise import CorrelatedNoise
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import PERFECT, Maps, draw_maps, lit, measured_dark_map
@@ -76,7 +75,7 @@ class PixelArray:
     @property
     def follows_photons(self) -> bool:
         """Whether a counting pixel depends on the exposure before."""
-        return isinstance(self.sensor, CountingSPAD) and bool(self.defects.carry_dead_time or self.defects.afterpulse)
+        return self.sensor.follows_photons and bool(self.defects.carry_dead_time or self.defects.afterpulse)
 
     @property
     def reach(self) -> int:
@@ -202,14 +201,11 @@ class PixelArray:
 def _check_model(defects: Defects, sensor: Sensor) -> None:
     """Raise `ValueError` for defects that this model of sensor cannot have."""
     name = type(sensor).__name__
-    read_out = (
-        defects.pattern.offset or defects.pattern.read_noise or {"offset_map", "read_noise_map"} & set(defects.maps)
-    )
-    if read_out and not isinstance(sensor, QIS):
+    if defects.read_out and not sensor.has_read_out:
         raise ValueError(f"defects: a {name} has no read-out; offset and read_noise are for a QIS")
-    if isinstance(sensor, QIS) and (defects.afterpulse or defects.crosstalk):
+    if sensor.has_read_out and defects.disturbed:
         raise ValueError("defects: a QIS has no avalanches, so neither afterpulse nor crosstalk")
-    counting = isinstance(sensor, CountingSPAD)
+    counting = sensor.follows_photons
     if (defects.carry_dead_time or defects.afterpulse_delay) and not counting:
         raise ValueError(f"defects: carry_dead_time and afterpulse_delay are for a CountingSPAD, this is a {name}")
     if counting and defects.afterpulse and not defects.afterpulse_delay:

@@ -28,7 +28,6 @@ from qsim.clip.motion_statistics import CODE_PLANES, SLOWEST, looks, moving_mean
 from qsim.colour import psnr
 from qsim.optics import radiometry
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons, light_level
 from qsim.studies.bit_depth.laws import Structure
@@ -197,7 +196,7 @@ def _equivalent(readout: Readout, frame: Exposed) -> Array:
         return frame.photons
     sensor = readout.sensor
     mean_quiet = np.maximum(frame.quiet / frame.planes, 1e-290)
-    if isinstance(sensor, BinarySPAD):
+    if sensor.sums_planes:
         arrivals = -np.log(mean_quiet) - sensor.dark_rate * readout.exposure
         return frame.planes * np.maximum(arrivals, 0.0) / sensor.efficiency
     grid = np.append(0.0, np.geomspace(1e-5, 1.0, 4 * GRID) * 4 * max(frame.photons.max() / frame.planes, 1e-12))

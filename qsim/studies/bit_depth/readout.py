@@ -13,13 +13,10 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.sensor import colour_filter, devices
-from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
 from qsim.sensor.file_laws import Conditions
-from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
-from qsim.sensor.spike import SpikeCamera
 
 MODELS = ("planes", "multibit")  # M binary planes, or one read of b bits
 GRID = 600  # light levels at which moments are tabulated
@@ -118,7 +115,7 @@ class Readout:
 
     def noiseless(self) -> Readout:
         """Return the same readout without read noise."""
-        return replace(self, sensor=replace(self.sensor, read_noise=0.0)) if isinstance(self.sensor, QIS) else self
+        return replace(self, sensor=self.sensor.without_read_noise())
 
 
 def _is_file(name: str) -> bool:
@@ -135,10 +132,9 @@ def at_depth(name: str, bits: int, ppp: float, exposure: float, temperature: flo
     if not _is_file(name):
         return devices.load(name, ppp=ppp, bits=bits, exposure=exposure)
     sensor = _of_file(name, bits, temperature)
-    if isinstance(sensor, BinarySPAD | CountingSPAD):
-        return replace(sensor, bits=bits)
-    if isinstance(sensor, QIS) and (sensor.gain, sensor.offset) == (1.0, 0.0):
-        return replace(sensor, bits=bits)
+    found = sensor.at_depth(bits)
+    if found is not None:
+        return found
     if sensor.bits != bits:
         raise ValueError(
             f"{name}: its gain and offset belong to its {sensor.bits} bits, and {bits} are asked for; give a QIS of "
@@ -153,7 +149,7 @@ def _of_file(name: str, bits: int, temperature: float | None) -> Sensor:
     `bits` are those of a file that states none.
     """
     sensor = devices.from_toml(name, bits, Conditions(temperature))
-    if isinstance(sensor, SpikeCamera):
+    if sensor.keeps_charge:
         raise ValueError(
             f"{name}: planes of a spike camera depend on each other, which this study does not model; name another "
             "sensor"

@@ -130,7 +130,7 @@ def _measure(
     draws: dict[str, Callable[[], Array]] = {
         engine: partial(sensor.sample, light, EXPOSURE, key=key, engine=engine) for engine in engines
     }
-    if isinstance(sensor, QIS):
+    if sensor.has_read_out:
         draws["numpy"] = _numpy_way(sensor, light, seed)
     codes, seconds = _race(draws)
     speed = {engine: light.size / s / 1e6 for engine, s in seconds.items()}
@@ -175,12 +175,12 @@ def _packed(shape: tuple[int, ...], seed: int, require_speed: bool) -> list[Sens
     return [SensorRow(name, "numpy", speed["numpy"]), judged(fast, 1, require_speed)]
 
 
-def _numpy_way(sensor: QIS, light: Array, seed: int) -> Callable[[], Array]:
+def _numpy_way(sensor: Sensor, light: Array, seed: int) -> Callable[[], Array]:
     """Return a function that draws codes in the usual way: Poisson plus Gaussian, rounded and clipped."""
     rng = np.random.default_rng(seed)
 
     def draw() -> Array:
-        electrons = rng.poisson(sensor.arrivals(light, EXPOSURE)) + rng.normal(0, sensor.read_noise, light.shape)
+        electrons = rng.poisson(sensor.arrivals(light, EXPOSURE)) + rng.normal(0, sensor.blur, light.shape)
         return np.clip(np.rint(sensor.gain * electrons + sensor.offset), 0, sensor.levels - 1).astype(sensor.dtype)
 
     return draw
@@ -243,33 +243,56 @@ def _cdf_error(sensor: Sensor, engine: str) -> float | None:
         plan = plan_of(sensor, EXPOSURE)
         assert plan is not None
         found = kernel.cdf_steps(plan, photons)
-        if isinstance(sensor, BinarySPAD):  # the kernel compares plane by plane
-            expected = np.exp(-sensor.arrivals(photons, EXPOSURE) / sensor.planes)[:, None]
+        if sensor.sums_planes:  # the kernel compares plane by plane
+            expected = np.exp(-sensor.arrivals(photons, EXPOSURE) / (sensor.levels - 1))[:, None]
         found = np.minimum(found, 1)
         expected = np.minimum(expected, 1)
     return float(np.abs(found - expected).max())
 
 
 def _written_out(sensor: Sensor, photons: Array) -> Array | None:
-    """Return F_0 ... by independent formulae, [G] -> [G, levels - 1]: sums over electrons, binomial and gamma laws."""
+    """Return F_0 ... by independent formulae, [G] -> [G, levels - 1]; None where there is none."""
+    formula = _FORMULAE.get(sensor.code_model)
+    if formula is None:
+        return None
+    return formula(sensor, sensor.arrivals(photons, EXPOSURE)[:, None], np.arange(sensor.levels - 1))
+
+
+def _by_electrons(sensor: Any, arrivals: Array, k: Array) -> Array:
+    """Return F_k of a QIS as a sum over electrons: [G, 1], [levels - 1] -> [G, levels - 1]."""
     from scipy import stats
 
-    arrivals = sensor.arrivals(photons, EXPOSURE)[:, None]
-    k = np.arange(sensor.levels - 1)
-    if isinstance(sensor, QIS):
-        n = np.arange(int(arrivals.max() + 12 * sqrt(arrivals.max()) + 60))
-        if sensor.read_noise:
-            threshold = (k + 0.5 - sensor.offset) / sensor.gain
-            below = stats.norm.cdf((threshold - n[:, None]) / sensor.read_noise)
-        else:
-            below = (sensor.codes_of(n.astype(float))[:, None] <= k).astype(float)
-        return stats.poisson.pmf(n, arrivals) @ below
-    if isinstance(sensor, BinarySPAD):
-        return stats.binom.cdf(k, sensor.planes, -np.expm1(-arrivals / sensor.planes))
-    if isinstance(sensor, CountingSPAD) and not sensor.paralyzable:
-        live = np.maximum(1 - k * sensor.dead_time / EXPOSURE, 0)
-        return stats.gamma.sf(arrivals * live, k + 1)
-    return None
+    n = np.arange(int(arrivals.max() + 12 * sqrt(arrivals.max()) + 60))
+    if sensor.read_noise:
+        threshold = (k + 0.5 - sensor.offset) / sensor.gain
+        below = stats.norm.cdf((threshold - n[:, None]) / sensor.read_noise)
+    else:
+        below = (sensor.codes_of(n.astype(float))[:, None] <= k).astype(float)
+    return np.asarray(stats.poisson.pmf(n, arrivals) @ below)
+
+
+def _by_planes(sensor: Any, arrivals: Array, k: Array) -> Array:
+    """Return F_k of a clocked SPAD by the binomial law of its planes: [G, 1], [levels - 1] -> [G, levels - 1]."""
+    from scipy import stats
+
+    return np.asarray(stats.binom.cdf(k, sensor.planes, -np.expm1(-arrivals / sensor.planes)))
+
+
+def _by_live_time(sensor: Any, arrivals: Array, k: Array) -> Array | None:
+    """Return F_k of a counting SPAD by the gamma law of its live time; None for a paralyzable one."""
+    from scipy import stats
+
+    if sensor.paralyzable:
+        return None
+    live = np.maximum(1 - k * sensor.dead_time / EXPOSURE, 0)
+    return np.asarray(stats.gamma.sf(arrivals * live, k + 1))
+
+
+_FORMULAE: dict[str, Callable[[Any, Array, Array], Array | None]] = {
+    QIS.code_model: _by_electrons,
+    BinarySPAD.code_model: _by_planes,
+    CountingSPAD.code_model: _by_live_time,
+}
 
 
 def judged(row: SensorRow, checks: int, require_speed: bool) -> SensorRow:
