@@ -32,7 +32,6 @@ from qsim.report.panels import (
 )
 from qsim.sensor.defects import defect_table, fixed_pattern
 from qsim.sensor.defects.pixel_array import PixelArray
-from qsim.streams import gates
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
 from qsim.streams.stream import Stream
@@ -158,9 +157,7 @@ def stream_line(stream: Stream) -> str:
 
 def timing_words(stream: Stream) -> str:
     """Return "; each row 2e-06 s later, down", and a schedule of exposures; "" where all are read at once and alike."""
-    rows = stream.rows
-    timing = "" if rows is None else f"; {rows}"
-    return timing + ("" if stream.shares is None else f"; {gates.words(stream.shares)}")
+    return stream.timing.words()
 
 
 def defects_words(stream: Stream) -> str:

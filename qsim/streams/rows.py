@@ -88,10 +88,9 @@ class Rows:
             found[self._place(part, crop)] = light
         return found
 
-    def picked(self, read: Read, t: float, crop: Crop, shifts: Array) -> Array:
-        """Return images [..., h, w] of which each line is that of the clip frame nearest to t plus its delay."""
-        nearest = np.floor(t + shifts + 0.5).astype(int)
-        blocks = [(part, read(frame, part)) for frame, part, _ in self._blocks(nearest, crop)]
+    def picked(self, read: Read, frames: Array, crop: Crop) -> Array:
+        """Return images [..., h, w] of which each line is that of its clip frame in `frames`, int [lines]."""
+        blocks = [(part, read(frame, part)) for frame, part, _ in self._blocks(frames, crop)]
         first = blocks[0][1]
         found = np.empty((*first.shape[:-2], *crop[2:]), first.dtype)
         for part, image in blocks:

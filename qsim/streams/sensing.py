@@ -21,21 +21,17 @@ from qsim.files import Progress, check_name
 from qsim.kinds import Bits, Frames, Light, Name, Number, Positive, RowOrder, Schedule, Seed, Text
 from qsim.sensor import colour_filter, devices, file_laws, packing
 from qsim.sensor.colour_filter import ColourFilter
-from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.event_simulation import TOLERANCE, Effects
 from qsim.sensor.defects.pixel_array import PixelArray, require_effect
 from qsim.sensor.file_laws import Conditions
-from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD
-from qsim.sensor.spike import SpikeCamera
 from qsim.settings import setting
-from qsim.streams import gates
+from qsim.streams.exposures import Timing
 from qsim.streams.photons import light_level, light_line
 from qsim.streams.rows import Rows
-from qsim.streams.simulation import Draw, plane_of, same_settings, stored
+from qsim.streams.simulation import Draw, same_settings, stored
 from qsim.streams.stream import Stream, write_packed, writing
 
 
@@ -216,17 +212,17 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     )
     if filters is not None and own is None:
         filters = _by_curve(filters, clip, sensing)
-    if found is not None and isinstance(sensor, SpikeCamera):
+    if found is not None and sensor.keeps_charge:
         raise ValueError(f"{sensing.sensor_name}: defects of spike cameras are not modelled; leave [defects] out")
     if found is not None:  # a measured dark map replaces the dark rate of the sensor
         sensor = PixelArray.of(found, sensor, *clip.shape[1:], clip.origin).sensor
     _check_planes(sensor, sensing, clip)
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
-    plane = plane_of(sensor, planes)
     if sensing.exposures is not None:
         _check_exposures(sensing, sensor, found)
-    draw = Draw(sensor, plane, level, key, planes, sensing.diffraction, found, rows=sensing.rows, colour=filters)
-    return dataclasses.replace(draw, shares=sensing.exposures, origin=clip.origin)
+    timing = Timing(planes, sensing.group, sensing.rows, sensing.exposures)
+    draw = Draw(sensor, level, key, timing, sensing.diffraction, found, colour=filters)
+    return dataclasses.replace(draw, origin=clip.origin)
 
 
 def _wavelength(clip: ClipFolder) -> float | None:
@@ -251,9 +247,9 @@ def _by_curve(filters: ColourFilter, clip: ClipFolder, sensing: Sensing) -> Colo
 def _check_exposures(sensing: Sensing, sensor: Sensor, found: Defects | None) -> None:
     """Raise `ValueError` if pixels remember the exposure before, so that all must be equal."""
     remembers = found is not None and (found.afterpulse or found.carry_dead_time)
-    if isinstance(sensor, SpikeCamera):
+    if sensor.keeps_charge:
         raise ValueError(f"exposures: {sensing.sensor_name} integrates without a pause; leave them out")
-    if remembers or ((sensing.follow or sensing.slices > 1) and isinstance(sensor, CountingSPAD)):
+    if remembers or ((sensing.follow or sensing.slices > 1) and sensor.follows_photons):
         what = (
             "afterpulses and carried dead time"
             if remembers
@@ -284,11 +280,11 @@ def _check_rows(sensing: Sensing, clip: ClipFolder, period: int) -> None:
 def _check_planes(sensor: Sensor, sensing: Sensing, clip: ClipFolder) -> None:
     """Raise `ValueError` if sums of planes or slices of exposures do not fit the sensor or the clip."""
     kind = type(sensor).__name__
-    if sensing.follow and not isinstance(sensor, CountingSPAD):
+    if sensing.follow and not sensor.follows_photons:
         raise ValueError(f"{sensing.sensor_name}: only the photons of a CountingSPAD are followed, this is a {kind}")
-    if sensing.group and not isinstance(sensor, BinarySPAD):
+    if sensing.group and not sensor.sums_planes:
         raise ValueError(f"{sensing.sensor_name}: only a clocked SPAD (BinarySPAD) sums planes, this is a {kind}")
-    if sensing.slices > 1 and not isinstance(sensor, CountingSPAD | QIS):
+    if sensing.slices > 1 and not sensor.takes_slices:
         raise ValueError(
             f"{sensing.sensor_name}: slices of an exposure are for a CountingSPAD or a QIS, this is a {kind}"
         )
@@ -311,7 +307,7 @@ def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
     return (
         named
         | {
-            "shape": [draw.count(clip), height, width],
+            "shape": [len(draw.exposures(clip)), height, width],
             "ppp_target": sensing.ppp,
             "lux_target": sensing.lux,
             "ppp": draw.level.ppp * draw.planes,
@@ -330,9 +326,9 @@ def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
             "drawn_by": draw.law,
         }
         | ({} if draw.defects is None else {"defects": draw.defects.to_dict()})
-        | ({} if draw.rows is None else {"rows": draw.rows.to_dict()})
+        | ({} if draw.timing.rows is None else {"rows": draw.timing.rows.to_dict()})
         | ({} if draw.colour is None else {"colour": draw.colour.to_dict()})
-        | ({} if draw.shares is None else {"exposures": list(draw.shares)})
+        | ({} if draw.timing.shares is None else {"exposures": list(draw.timing.shares)})
         | ({} if draw.origin == (0, 0) else {"origin": list(draw.origin)})
         | _temperature(sensing)
         | ({} if sensing.pixel_pitch is None else {"pixel_pitch": sensing.pixel_pitch})
@@ -367,12 +363,9 @@ def sense(
     line = light_line(whole, efficiency, draw.colour, clip.bands)
     if draw.colour is not None:
         line += f"; {draw.colour.words(efficiency)}"
-    if draw.rows is not None:
-        line += f"; {draw.rows}"
-    if draw.shares is not None:
-        line += f"; {gates.words(draw.shares)}"
-    line += draw.about_flicker(clip)
-    if draw.rows is None and draw.planes % 2 == 0:
+    line += draw.timing.words()
+    line += draw.exposures(clip).about_flicker(clip.strengths)
+    if draw.timing.rows is None and draw.planes % 2 == 0:
         line += "; its truth is half a clip frame late, which an odd number of slices avoids"
     if draw.defects is not None:
         effects = [key for key, value in draw.defects.to_dict().items() if value and key != "device_seed"]

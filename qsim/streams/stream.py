@@ -27,7 +27,7 @@ from qsim.clip.lazy_array import LazyArray
 from qsim.files import VERSION, Progress
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.sensor import packing
-from qsim.streams import gates
+from qsim.streams.exposures import Timing
 from qsim.streams.photons import clip_photons
 from qsim.streams.rows import Rows, from_dict
 
@@ -138,22 +138,26 @@ class Stream:
             raise ValueError(f"{self.path}: truth at the time of each row or of the middle of the frame, got {at!r}")
         frames = self._existing(start, len(self) if stop is None else stop)
         clip = self.clip
-        factor = self.photons_factor * self._planes
+        exposures = self.timing.over(clip)
+        factor = self.photons_factor * self.timing.frames
 
         def sharp(frame: int, crop: Crop | None = None) -> Array:
             return clip_photons(clip, frame, factor, crop, sharp=True)
 
-        return np.stack([self._at_mid_exposure(sharp, t, at) for t in frames])
+        return np.stack([exposures.middle(sharp, t, at) for t in frames])
 
     def known(self) -> Array | None:
         """Return bool [T, H, W], False where light of `truth` is cut off (`Clip.saturated`); None if all is known."""
         if self.clip.bands is not None or not self.clip.info.saturated_pixels:  # of colour they are counted only
             return None
-        return ~np.stack([self._at_mid_exposure(self.clip.saturated, t) for t in range(len(self))])
+        exposures = self.timing.over(self.clip)
+        return ~np.stack([exposures.middle(self.clip.saturated, t) for t in range(len(self))])
 
     @property
-    def _planes(self) -> int:
-        return int(self.meta.get("planes_per_code") or 1)
+    def timing(self) -> Timing:
+        """When codes collect light: clip frames, rows and schedule."""
+        frames = int(self.meta.get("planes_per_code") or 1)
+        return Timing(frames, frames > 1 and self.sensor.sums_planes, self.rows, self.shares)
 
     @cached_property
     def rows(self) -> Rows | None:
@@ -164,16 +168,6 @@ class Stream:
         """Raise `ValueError` if rows have their own time or codes different exposures, which `what` does not know."""
         if self.rows is not None or self.shares is not None:
             raise ValueError(f"{self.path}: {what} needs rows read at once and equal exposures; leave this stream out")
-
-    def _at_mid_exposure(self, read: Callable[..., Array], t: int, at: str = "row") -> Array:
-        """Return `read(clip frame, crop)` [H, W] in the middle of code t: of each row's exposure, or of all of them."""
-        if self.rows is None:
-            return read(t * self._planes + self._planes // 2)
-        middle = t * self._planes + (self._planes - 1) / 2
-        shifts = self.rows.shifts(*self.shape[1:], self.clip.frame_rate)
-        if at == "frame":
-            return read(math.floor(middle + shifts.mean() + 0.5))
-        return self.rows.picked(read, middle, (0, 0, *self.shape[1:]), shifts)
 
     def _existing(self, start: int, stop: int) -> range:
         """Return frames start ... stop - 1; `ValueError` if they do not all exist."""
@@ -214,7 +208,7 @@ class Stream:
     @property
     def exposures(self) -> Array:
         """Seconds of light in each code, float64 [T]."""
-        return np.array([gates.share_of(self.shares or (1.0,), t) for t in range(len(self))]) * self.exposure
+        return np.array([self.timing.share(t) for t in range(len(self))]) * self.exposure
 
     @property
     def photons_factor(self) -> float:

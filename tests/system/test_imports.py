@@ -8,12 +8,15 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+import qsim.sensor.devices
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("qsim", "quiver", "scenes")
@@ -178,6 +181,29 @@ def test_no_module_is_named_like_a_function_of_its_face():
     for face, names in homes().items():
         modules = {p.stem for p in (ROOT / face.replace(".", "/")).iterdir()}
         assert not [name for name, home in names.items() if name in modules and home != face], face
+
+
+def asked_for(tree: ast.AST, names: set[str]) -> Iterator[str]:
+    """The classes of these names that `isinstance`, `issubclass` or a pattern of `match` asks for."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("isinstance", "issubclass"):
+            found = {part.split(".")[-1] for part in re.findall(r"[\w.]+", ast.unparse(node.args[1]))}
+            yield from found & names
+        elif isinstance(node, ast.MatchClass):
+            yield from {ast.unparse(node.cls).split(".")[-1]} & names
+
+
+def test_no_room_asks_which_model_a_sensor_is():
+    """A model states what it can do (qsim/sensor/sensor.py): a new one then works everywhere. `Sensor` is no model."""
+    models = {"SPAD", *qsim.sensor.devices.MODELS}
+    assert {"QIS", "BinarySPAD", "CountingSPAD", "SpikeCamera"} < models
+    rooms = [p for p in sources() if room_of(name_of(p)) != "qsim.sensor"]
+    asked_by = {name_of(p): list(asked_for(ast.parse(p.read_text(encoding="utf-8")), models)) for p in rooms}
+    assert not {name: found for name, found in asked_by.items() if found}
+    seen = ast.parse(
+        "isinstance(a, QIS | b.SPAD)\nmatch a:\n    case SpikeCamera():\n        pass\nisinstance(a, Sensor)"
+    )
+    assert sorted(asked_for(seen, models)) == ["QIS", "SPAD", "SpikeCamera"]
 
 
 def test_every_name_of_a_face_can_be_imported():

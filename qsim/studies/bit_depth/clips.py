@@ -13,8 +13,9 @@ from qsim.clip.clip_info import ClipInfo, Grouped, Origin, SceneName
 from qsim.clip.manifest import target_of
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
-from qsim.sensor.spad import BinarySPAD
+from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
+from qsim.streams.exposures import Timing
 from qsim.streams.photons import light_level
 from qsim.streams.sensing import Sensing, describe, sense, write_stream
 from qsim.streams.simulation import Draw
@@ -133,10 +134,10 @@ def check_sensors(settings: StudySettings, streams: bool) -> None:
         _summed_plane(settings, 1.0, 1e-4)
 
 
-def _summed_plane(settings: StudySettings, ppp: float, exposure: float) -> BinarySPAD:
+def _summed_plane(settings: StudySettings, ppp: float, exposure: float) -> Sensor:
     """Return the sensor of planes whose sums are stored; raise `ValueError` if it is no clocked SPAD."""
     plane = plane_sensor(settings, ppp, exposure)
-    if not isinstance(plane, BinarySPAD):
+    if not plane.sums_planes:
         raise ValueError("streams of summed planes need a clocked SPAD; leave out the plane sensor")
     return plane
 
@@ -168,11 +169,13 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings, *, force: b
         grouped = group(clip, path, m, force=force)
         sense(grouped, read)
         key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
-        draw = Draw(replace(plane, bits=bits), plane, level, key, m, False, origin=clip.origin)
+        summed = plane.at_depth(bits)
+        assert summed is not None  # planes are summed at every depth
+        draw = Draw(summed, level, key, Timing(m, summed=True), origin=clip.origin)
         # A code is one frame of `grouped`: its exposure is m times longer, which relative light does not know.
         more, before = (m, 1) if clip.camera is None else (1, m)
         of_code = replace(level, factor=more * level.factor, ppp=m * level.ppp, mean_before=before * level.mean_before)
-        meta = describe(grouped, replace(read, sensor=draw.sensor), replace(draw, level=of_code, planes=1))
+        meta = describe(grouped, replace(read, sensor=draw.sensor), replace(draw, level=of_code, timing=Timing()))
         meta |= {"planes_of": str(clip.path), "drawn_by": draw.law, "seed": None}  # `grouped` cannot draw it again
         frames = (draw.frames(clip, t, t + 1) for t in range(len(grouped)))
         write_stream(grouped, "planes", frames, draw.sensor, meta)

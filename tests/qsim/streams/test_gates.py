@@ -14,7 +14,7 @@ from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import FixedPattern
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
-from qsim.streams import gates
+from qsim.streams.exposures import gate
 from qsim.streams.sensing import Sensing, prepare, replay, sense
 from qsim.studies.readouts import compare
 
@@ -39,10 +39,10 @@ def test_a_gate_takes_the_middle_of_the_slices():
         slices = int(rng.integers(1, 20))
         inside = np.abs(moments - 0.5) <= share / 2
         counted = np.bincount((moments[inside] * slices).astype(int), minlength=slices) * slices / moments.size
-        np.testing.assert_allclose(gates.weights(share, slices), counted, atol=3e-5 * slices)
-        assert gates.weights(share, slices).sum() == pytest.approx(share * slices, rel=1e-12)
-    np.testing.assert_array_equal(gates.weights(1.0, 5), np.ones(5))
-    np.testing.assert_allclose(gates.weights(0.4, 5), [0, 0.5, 1, 0.5, 0], atol=1e-12)
+        np.testing.assert_allclose(gate(share, slices), counted, atol=3e-5 * slices)
+        assert gate(share, slices).sum() == pytest.approx(share * slices, rel=1e-12)
+    np.testing.assert_array_equal(gate(1.0, 5), np.ones(5))
+    np.testing.assert_allclose(gate(0.4, 5), [0, 0.5, 1, 0.5, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", SENSORS)
@@ -71,7 +71,7 @@ def test_codes_have_the_law_of_their_exposure(tmp_path, kind):
     flat = np.full((9, 41, 53), 1.0)
     clip = write_clip(tmp_path / "flat", radiance=flat, relative=True)
     draw = prepare(clip, Sensing(sensor, ppp=6.0, exposures=SCHEDULE, **how))
-    codes = draw.frames(clip, 0, draw.count(clip))
+    codes = draw.frames(clip, 0, len(draw.exposures(clip)))
     for t, drawn in enumerate(codes):
         share = SCHEDULE[t % 3]
         light = np.array([6.0 * share])

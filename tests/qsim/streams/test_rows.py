@@ -58,9 +58,14 @@ def test_every_pixel_sees_its_own_interval_of_the_light(tmp_path, order, kind):
         draw = prepare(clip, Sensing(sensor, row_delay=delay, row_order=order, **how))
         light = np.stack([draw.incident(clip, t) for t in range(14)])
         starts = lines(order, height, width) * delay * RATE
-        assert draw.count(clip) == (14 - int(np.ceil(starts.max() - 1e-9))) // planes
-        for t in (0, draw.count(clip) * planes - 1):
-            np.testing.assert_allclose(draw.light(clip, t, t + 1)[0], interval(light, t + starts, 1.0), rtol=1e-9)
+        exposures = draw.exposures(clip)
+        assert len(exposures) == (14 - int(np.ceil(starts.max() - 1e-9))) // planes
+        for t in (0, len(exposures) - 1):
+            for exposure, found in zip(exposures[t], draw.light(clip, t, t + 1), strict=True):
+                length = len(exposure.frames)
+                np.testing.assert_allclose(found, interval(light, exposure.frames.start + starts, length), rtol=1e-9)
+                np.testing.assert_allclose(np.unique(exposure.begin * RATE), np.unique(exposure.frames.start + starts))
+                np.testing.assert_allclose((exposure.end - exposure.begin) * RATE, length)
         assert draw.frames(clip, 0, 1).shape == (1, height, width)
 
 
@@ -97,7 +102,7 @@ def test_interpolated_rows_approach_rows_rendered_at_their_instants(tmp_path):
         clip = write_clip(name, radiance=light, relative=True, frame_rate=n * RATE, exposure=1 / n / RATE)
         how = {"slices": n} if n > 1 else {}
         draw = prepare(clip, Sensing(COUNTER, ppp=1.0, row_delay=delay, **how))
-        found = draw.light(clip, n, 2 * n).sum(axis=0) / n / draw.level.factor
+        found = draw.light(clip, 1, 2)[0] / n / draw.level.factor
         starts = fine + np.arange(height)[:, None] * 0.1 * fine + np.zeros(width)
         errors.append(float(np.sqrt(np.mean((found - interval(exact, starts, fine) / fine) ** 2))))
     assert errors[0] < 0.2 * exact.std()
@@ -174,7 +179,7 @@ def test_rows_read_no_frame_beyond_their_reach(tmp_path):
     """Delays that are whole but for rounding, as 100 x 0.55 = 55 + 7e-15, and random ones."""
     clip = write_clip(tmp_path / "clip", frames=111, height=101, width=2)
     draw = prepare(clip, Sensing(COUNTER, ppp=1.0, slices=56, row_delay=2.75e-4))
-    assert draw.count(clip) == 1
+    assert len(draw.exposures(clip)) == 1
     assert draw.frames(clip, 0, 1).shape == (1, 101, 2)
     rng = np.random.default_rng(0)
     for _ in range(300):
