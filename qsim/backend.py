@@ -127,18 +127,10 @@ def decide(wanted: str | None) -> RenderEngine:
             return RenderEngine(VARIANTS["cuda"], "cuda", None, probe.detail)
         failures.append(f"CUDA: {probe.detail}")
     if wanted in (None, "llvm"):
-        libraries = llvm.usable()
-        for path, origin in libraries:
-            probe = cached_probe(VARIANTS["llvm"], path)
-            if probe.works:
-                return RenderEngine(VARIANTS["llvm"], "llvm", path, f"{probe.detail} {origin}, {path}")
-            failures.append(f"{path}: {probe.detail}")
-            if origin == llvm.HELD:
-                failures[-1] += f"; it is the one {origin}: set {llvm.VARIABLE} to a newer one before drjit is imported"
-            if path == os.environ.get(llvm.VARIABLE):
-                warnings.warn(f"{llvm.VARIABLE}={failures[-1]}; looking further", RuntimeWarning, stacklevel=3)
-        if not libraries:
-            failures.append(f"no libLLVM of version {llvm.OLDEST} or newer found")
+        found, reasons = _with_llvm()
+        if found is not None:
+            return found
+        failures += reasons
     if wanted == "scalar":
         return RenderEngine(VARIANTS["scalar"], "scalar", None, "asked for")
     why = "; ".join(failures)
@@ -147,6 +139,25 @@ def decide(wanted: str | None) -> RenderEngine:
         raise ValueError(f"engine {wanted} does not work here ({why}); {hint}")
     warnings.warn(f"rendering with the slow scalar engine ({why}): {INSTALL_HINT}", RuntimeWarning, stacklevel=3)
     return RenderEngine(VARIANTS["scalar"], "scalar", None, why)
+
+
+def _with_llvm() -> tuple[RenderEngine | None, list[str]]:
+    """Return the engine of the first LLVM that works, or None, and why those before it do not."""
+    libraries = llvm.usable()
+    if not libraries:
+        return None, [f"no libLLVM of version {llvm.OLDEST} or newer found"]
+    failures: list[str] = []
+    for path, origin in libraries:
+        probe = cached_probe(VARIANTS["llvm"], path)
+        if probe.works:
+            return RenderEngine(VARIANTS["llvm"], "llvm", path, f"{probe.detail} {origin}, {path}"), failures
+        reason = f"{path}: {probe.detail}"
+        if origin == llvm.HELD:
+            reason += f"; it is the one {origin}: set {llvm.VARIABLE} to a newer one before drjit is imported"
+        if path == os.environ.get(llvm.VARIABLE):
+            warnings.warn(f"{llvm.VARIABLE}={reason}; looking further", RuntimeWarning, stacklevel=4)
+        failures.append(reason)
+    return None, failures
 
 
 decided = lru_cache(decide)

@@ -89,13 +89,7 @@ def load(
     if str(name) in FAMILIES:
         return FAMILIES[str(name)](seed, speed=speed)
     if str(name).endswith(".py"):
-        with _naming_mistakes(Path(name)):
-            found = _from_file(Path(name))(seed, speed=speed)
-        if not isinstance(found, Scene):
-            raise ValueError(f"{name}: scene() returned a {type(found).__name__}; it must return a qsim.scene.Scene")
-        if speed != 1 and not along_path and _moves_alike(found, _from_file(Path(name))(seed, speed=1.0)):
-            raise ValueError(f"{name}: moves at speed {speed:g} as at 1; let scene() use its speed, or leave it out")
-        return found
+        return _of_program(Path(name), seed, speed, along_path)
     if str(name).endswith(".xml"):
         if speed != 1 and not along_path:
             raise ValueError(f"{name}: an XML scene has no motion, so speed {speed:g} changes nothing; leave it out")
@@ -104,13 +98,29 @@ def load(
         return read_mitsuba(name, bands=bands)
     if str(name).endswith(GLTF_SUFFIXES):
         return gltf_file.scene(seed, speed=speed, file=name)
-    if (Path(name) / "clip.json").is_file():
-        raise ValueError(f"{name}: is a clip, made from a scene already; name a family, a file or a folder")
-    if Path(name).is_dir():
+    if Path(name).is_dir() and not (Path(name) / "clip.json").is_file():
         return asset_folder.scene(seed, speed=speed, folder=name)
+    raise ValueError(_no_scene(name))
+
+
+def _of_program(path: Path, seed: int, speed: float, along_path: bool) -> Scene:
+    """Return the scene of a .py file; `ValueError` for a function that returns none, or that ignores the speed."""
+    with _naming_mistakes(path):
+        found = _from_file(path)(seed, speed=speed)
+    if not isinstance(found, Scene):
+        raise ValueError(f"{path}: scene() returned a {type(found).__name__}; it must return a qsim.scene.Scene")
+    if speed != 1 and not along_path and _moves_alike(found, _from_file(path)(seed, speed=1.0)):
+        raise ValueError(f"{path}: moves at speed {speed:g} as at 1; let scene() use its speed, or leave it out")
+    return found
+
+
+def _no_scene(name: str | Path) -> str:
+    """Return why a name is none of a scene."""
+    if (Path(name) / "clip.json").is_file():
+        return f"{name}: is a clip, made from a scene already; name a family, a file or a folder"
     if str(name) in RECIPES or Path(name).suffix == ".toml":
-        raise ValueError(f"{name}: is a recipe of a data set, not a scene; use `qsim generate {name}`")
-    raise ValueError(
+        return f"{name}: is a recipe of a data set, not a scene; use `qsim generate {name}`"
+    return (
         f"no scene family {str(name)!r}{suggest(str(name), FAMILIES)}; there are {', '.join(FAMILIES)}, "
         "or give a .py, .glb, .gltf or .xml file or a folder"
     )

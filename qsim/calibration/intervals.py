@@ -125,39 +125,38 @@ class _Search:
         The search starts at the fit, or at another maximum of the likelihood.
         """
         self.last = mode or self.fit.state
+        limit = bound if side < 0 else inf  # only a lower end has a bound
         near = float(self.direction @ self.last.parameters)
         at_near = self.root_of(self.last)
         far = near + side * sqrt(max(target**2 - at_near**2, 0.1)) * self.error
-        if side < 0:
-            far = max(far, bound)
         for count in range(20):
+            far = max(far, limit) if side < 0 else far
             found = self.root(far)
             if abs(found / target - 1) < CLOSE:
                 return near + (far - near) * (target - at_near) / (found - at_near), count == 0 and mode is None
             if found > target:
-                break
-            if far == bound:
+                return self._between(near, far, at_near, found, target), False
+            if far == limit:
                 return bound, False
             if abs(far - self.value) > self.farthest:
-                return side * inf, False
+                break
             near = far
             at_near = found
             far = self.value + (far - self.value) * min(max(1.1 * target / max(found, 1e-3), 1.2), 3.0)
-            if side < 0:
-                far = max(far, bound)
-        else:
-            return side * inf, False
-        at_far = found
+        return side * inf, False
+
+    def _between(self, near: float, far: float, at_near: float, at_far: float, target: float) -> float:
+        """Return the value between two others where the root is `target`, by false position kept off the ends."""
         for _ in range(12):
             share = (target - at_near) / (at_far - at_near)
             middle = near + (far - near) * min(max(share, 0.08), 0.92)
             found = self.root(middle)
             if abs(found / target - 1) < CLOSE:
-                return middle, False
+                return middle
             if found < target:
                 near = middle
                 at_near = found
             else:
                 far = middle
                 at_far = found
-        return far, False
+        return far

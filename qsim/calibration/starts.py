@@ -63,40 +63,50 @@ def starts_of(cells: Sequence[Cell], share: Array, darks: int, brightest: float)
         light = [max((cell.mean - offset) / gain, 1e-3) for cell in cells if cell.stack >= darks]
         points.append(np.array([log(gain), offset, log(noise), max(electrons, 1e-4), *light]))
 
+    def by_exposures(at: float) -> float:
+        """Dark electrons of the longest exposure, by the difference of two exposures."""
+        return (cells[longest].mean - cells[shortest].mean) / at / (share[longest] - share[shortest])
+
     base = cells[shortest].mean
     for peak, shift in product(peaks, (1.0, 0.998, 1.002)):
         at = peak.gain * shift
         offset = peak.offset + at * np.floor((base - peak.offset) / at + 0.5)
         for back in range(int(2 + 2 * variance / at**2 + 3 * sqrt(variance) / at)):
-            electrons = max((base - offset) / at + back, 0.0) / share[shortest]
-            if several:
-                electrons = (cells[longest].mean - base) / at / (share[longest] - share[shortest])
-            add(at, offset - back * at, peak.noise, electrons)
+            alone = max((base - offset) / at + back, 0.0) / share[shortest]
+            add(at, offset - back * at, peak.noise, by_exposures(at) if several else alone)
     hidden = not peaks and sqrt(variance) / gain > 1.2
-    step = min(STEP * gain / max(brightest, 1e-9), 0.1)
-    steps = range(-SHIFTS, SHIFTS + 1)
-    if points and gain >= FINE:
-        steps = range(1)
-    for number in steps:
-        at = gain * (1 + number * step)
+    for at in _gains(gain, brightest, known=bool(points)):
         total = variance / at**2
-        tried: tuple[float, ...] = NOISES if gain < 2 * FINE else (0.35, 0.6)
-        if hidden:
-            tried = ()
+        tried = _noises(gain, hidden)
         if several:
-            electrons = (cells[longest].mean - cells[shortest].mean) / at / (share[longest] - share[shortest])
+            electrons = by_exposures(at)
             rest = sqrt(max(total - electrons * share[shortest], 0.01))
             for noise in {*tried, rest}:
-                add(at, cells[shortest].mean - at * electrons * share[shortest], noise, electrons)
+                add(at, base - at * electrons * share[shortest], noise, electrons)
             continue
         # read noise and dark electrons share the variance of the one exposure
         for noise in {*tried, *(sqrt(part * total) for part in PARTS)}:
             electrons = max(total - noise**2, 0.003 * total)
-            add(at, cells[shortest].mean - at * electrons, noise, electrons)
+            add(at, base - at * electrons, noise, electrons)
     visible = 0.35 if gain >= FINE else 0.15
     if peaks:
         visible = peaks[0].noise
     return Starts(points, sqrt(variance) / gain if hidden else visible, hidden)
+
+
+def _gains(gain: float, brightest: float, *, known: bool) -> list[float]:
+    """Return gains around a first one, near enough for the brightest cell; it alone if finer ones are `known`."""
+    if known and gain >= FINE:
+        return [gain]
+    step = min(STEP * gain / max(brightest, 1e-9), 0.1)
+    return [gain * (1 + number * step) for number in range(-SHIFTS, SHIFTS + 1)]
+
+
+def _noises(gain: float, hidden: bool) -> tuple[float, ...]:
+    """Return read noises [e-] to start from; none if read noise hides the electrons."""
+    if hidden:
+        return ()
+    return NOISES if gain < 2 * FINE else (0.35, 0.6)
 
 
 def first_gain(cells: Sequence[Cell]) -> float:

@@ -23,6 +23,7 @@ import os
 import re
 import sys
 import sysconfig
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -162,20 +163,32 @@ def _follow(path: Path, folders: list[Path], defaults: dict[str, str], found: se
         if element.tag == "default":
             defaults.setdefault(element.get("name", ""), element.get("value", ""))
         if element.tag == "path":
-            added = [folder / element.get("value", "") for folder in folders]
-            folders += [folder for folder in dict.fromkeys(map(_plain, added)) if folder not in folders]
-            if len(folders) > MOST_FOLDERS:
-                raise ValueError(f"{path}: names more than {MOST_FOLDERS} folders by <path>")
+            _add_folders(path, element.get("value", ""), folders)
     for element in elements:
-        for value in element.attrib.values():
-            written = re.sub(r"\$(\w+)", lambda match: defaults.get(match[1], match[0]), value)
-            for folder in dict.fromkeys(folders):
-                with contextlib.suppress(OSError, ValueError):  # the value is not the name of a file
-                    file = (folder / written).resolve()
-                    if file.is_file() and element.tag == "include":
-                        _follow(file, folders, defaults, found)
-                    elif file.is_file():
-                        found.add(file)
+        for file in _named_by(element, folders, defaults):
+            if element.tag == "include":
+                _follow(file, folders, defaults, found)
+            else:
+                found.add(file)
+
+
+def _add_folders(path: Path, value: str, folders: list[Path]) -> None:
+    """Add what a <path> names in every folder; `ValueError` for more folders than a scene needs."""
+    added = [folder / value for folder in folders]
+    folders += [folder for folder in dict.fromkeys(map(_plain, added)) if folder not in folders]
+    if len(folders) > MOST_FOLDERS:
+        raise ValueError(f"{path}: names more than {MOST_FOLDERS} folders by <path>")
+
+
+def _named_by(element: ElementTree.Element, folders: Sequence[Path], defaults: Mapping[str, str]) -> Iterator[Path]:
+    """Yield the existing files that the attributes of an element name, in any of the folders."""
+    for value in element.attrib.values():
+        written = re.sub(r"\$(\w+)", lambda match: defaults.get(match[1], match[0]), value)
+        for folder in dict.fromkeys(folders):
+            with contextlib.suppress(OSError, ValueError):  # the value is not the name of a file
+                file = (folder / written).resolve()
+                if file.is_file():
+                    yield file
 
 
 def _plain(folder: Path) -> Path:

@@ -256,16 +256,8 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     channels = first.shape[3] if first.ndim == 4 else 1
     if channels > 1 and hints.channel is None:
         raise ValueError(f"{path}: {channels} colour planes; choose one with --channel 0")
-    parts = []
-    for shard in shards:
-        array = load_array(shard)
-        if array.dtype.kind != "u" or array.ndim != 4 or channel >= array.shape[3]:
-            raise ValueError(
-                f"{shard}: expected unsigned [T, H, W, {channels}], found {array.dtype} {list(array.shape)}"
-            )
-        if array.shape[2] != (-(-width // 8) if packed else width):
-            raise ValueError(f"{shard}: {array.shape[2]} columns do not hold the width {width} of transforms.json")
-        parts.append(array[..., channel])
+    columns = -(-width // 8) if packed else width
+    parts = [_shard(shard, channel, channels, columns, width) for shard in shards]
     if packed:
         bits = 1
     else:
@@ -291,6 +283,16 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     model = "binary_sum" if packed else "binary_sum_static"
     odd = None if planes == 2**bits - 1 else planes
     return Recording(shape, read, Source(format="visionsim", bit_order="msb", bitplanes=odd), bits, model)
+
+
+def _shard(path: Path, channel: int, channels: int, columns: int, width: int) -> Array:
+    """Return one colour plane [T, H, columns] of a shard; `ValueError` for another type or shape."""
+    array = load_array(path)
+    if array.dtype.kind != "u" or array.ndim != 4 or channel >= array.shape[3]:
+        raise ValueError(f"{path}: expected unsigned [T, H, W, {channels}], found {array.dtype} {list(array.shape)}")
+    if array.shape[2] != columns:
+        raise ValueError(f"{path}: {array.shape[2]} columns do not hold the width {width} of transforms.json")
+    return array[..., channel]
 
 
 def _bits_of_sums(path: Path, planes: int, bits: int | None) -> int:

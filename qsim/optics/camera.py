@@ -56,13 +56,31 @@ class Camera:
     zoom: Zoom | None = field(default=None, metadata={"described": "if any"})  # replaces focal_length, lens over time
 
     def __post_init__(self) -> None:
-        checked_pitch(self.pixel_pitch, "Camera.pixel_pitch")
+        self._check_lens()
+        self._check_pixels()
+        self._check_pose()
+        if self.lens == Lens():
+            object.__setattr__(self, "lens", None)
+        if self.lens is not None:
+            _check(self.lens, self.corner)
+        if self.zoom is not None:
+            for t in self.zoom.moments():
+                self._zoomed(t)
+
+    def _check_lens(self) -> None:
+        """Raise `ValueError` for a lens that cannot be, or that cannot focus where it should."""
         if not 0 < self.focal_length < 3:
             raise ValueError(f"Camera.focal_length is in metres, got {self.focal_length!r}; 8 mm is 8e-3")
         if not 100e-9 <= self.wavelength <= 20e-6:
             raise ValueError(f"Camera.wavelength is in metres, got {self.wavelength!r}; 550 nm is 550e-9")
         if not self.f_number >= 0.5:
             raise ValueError(f"Camera.f_number must be at least 0.5, the limit of a lens in air, got {self.f_number!r}")
+        if self.focus_distance is not None and not 0 < self.focus_distance < math.inf:
+            raise ValueError(f"Camera.focus_distance is in metres before the camera, got {self.focus_distance!r}")
+
+    def _check_pixels(self) -> None:
+        """Raise `ValueError` for pixels that no sensor has."""
+        checked_pitch(self.pixel_pitch, "Camera.pixel_pitch")
         for name in ("transmission", "fill_factor"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"Camera.{name} must be in (0, 1], got {getattr(self, name)!r}")
@@ -71,8 +89,9 @@ class Camera:
                 raise ValueError(
                     f"Camera.{name} must be a positive whole number of pixels, got {getattr(self, name)!r}"
                 )
-        if self.focus_distance is not None and not 0 < self.focus_distance < math.inf:
-            raise ValueError(f"Camera.focus_distance is in metres before the camera, got {self.focus_distance!r}")
+
+    def _check_pose(self) -> None:
+        """Raise `ValueError` for a view without an orientation, and for a focus nearer than the lens reaches."""
         forward = np.subtract(self.target, self.origin)
         if not np.linalg.norm(np.cross(forward, self.up)) > 1e-9 * np.linalg.norm(forward):
             raise ValueError(
@@ -84,13 +103,6 @@ class Camera:
                 f"Camera: a lens of {self.focal_length:g} m cannot focus on a distance of {self.focus:g} m; give a "
                 "focus_distance above its focal_length, or leave aperture_blur off"
             )
-        if self.lens == Lens():
-            object.__setattr__(self, "lens", None)
-        if self.lens is not None:
-            _check(self.lens, self.corner)
-        if self.zoom is not None:
-            for t in self.zoom.moments():
-                self._zoomed(t)
 
     def at(self, t: float) -> Camera:
         """Return the camera as it is at time t [s]: the same one unless it has a `zoom`. Its motion stays."""

@@ -88,17 +88,7 @@ def choose_budget(
     software: an interrupted clip resumes with the same budget. `ValueError` for a `psnr` outside 10 to 80 dB, for
     other values out of range, and for a scene without light.
     """
-    if not 10 <= psnr <= 80:
-        raise ValueError(f"psnr: expected 10 to 80 dB, got {psnr!r}")
-    if frames < 1:
-        raise ValueError(f"frames: expected a whole number from 1 up, got {frames!r}")
-    for name, wish in (("denoise", denoise), ("reuse", reuse)):
-        if not isinstance(wish, bool | None):
-            raise ValueError(f"{name}: expected True, False or None, got {wish!r}")
-    if ppp is not None and not 0 < ppp < math.inf:
-        raise ValueError(f"ppp: expected photons per pixel above 0, or None, got {ppp!r}")
-    if not 1 <= planes < math.inf:
-        raise ValueError(f"planes: expected frames in a code from 1 up, got {planes!r}")
+    _check_wishes(psnr=psnr, frames=frames, denoise=denoise, reuse=reuse, ppp=ppp, planes=planes)
     if not 0 < quantum_efficiency <= 1:
         raise ValueError(f"quantum_efficiency: expected a number above 0, at most 1, got {quantum_efficiency!r}")
     pilot = Pilot.of(scene, frame_rate, shutter, frames, seed)
@@ -114,7 +104,6 @@ def choose_budget(
     rough, _ = allowed_in(exposed, psnr, ppp, quantum_efficiency, planes)
     bounces, cut, about_bounces = fewest_bounces(lambda depth: pilot.mean(COUNTS[1], depth), full, rough.repeated)
     left_out = Errors.between(cut, full, rough.white)
-    dimmed = dimming(full, cut)
     halves = [pilot.halves(count, bounces) for count in COUNTS]
     bright = halves[-1].mean(axis=0)
     allowed, limit = allowed_in(exposed if blurs else bright, psnr, ppp, quantum_efficiency, planes)
@@ -123,42 +112,105 @@ def choose_budget(
     blurred = 0.0
     about_blur = Finding("motion blur", "none, one instant", why)
     if blurs:
-        low, high = (float(np.percentile(bright, share)) for share in (0.1, 99.9))
-        contrast = allowed.fraction(Errors(min(high, allowed.white) - low, high - low))
-        instants, blurred, about_blur = fewest_instants(
-            pilot.extent, contrast, lambda k: allowed.fraction(pilot.changes(k, bounces, allowed.white))
-        )
+        instants, blurred, about_blur = _blur(pilot, bright, allowed, bounces)
     strict = allowed.repeated
     share = math.sqrt(1 - min(strict.fraction(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
     noise = Noise.of(halves, allowed.white).times(pilot.unevenness(instants))
-    samples, about_samples = fewest_samples(noise, instants, allowed, share)
+    found = _shared_or_alone(pilot, _Work(bounces, instants, frames, share, allowed, noise), denoise, reuse)
+    chosen = found.chosen
+    dimmed = dimming(full, cut)
+    pixels = scene.camera.height * scene.camera.width
+    noisy = noise.at(chosen.samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
+    findings = (
+        limit,
+        *found.findings,
+        about_bounces,
+        _light(dimmed, noisy, bool(chosen.denoise)),
+        moving(pilot.extent, shutter),
+        about_blur,
+        *flickering(pilot.renderer.strengths(frames), pilot.extent, instants),
+        *_lens(scene.camera),
+        *effects_left_out(scene.camera, pilot.truths(), scene.bands),
+    )
+    work = (chosen.samples, bounces, instants, instants > 1, bool(chosen.denoise))
+    errors = (left_out.plain, left_out.at_white, allowed.white, *dimmed)
+    return Budget(*work, *errors, findings, chosen.neighbours, chosen.denoise or "high")
+
+
+def _check_wishes(
+    *, psnr: float, frames: int, denoise: bool | None, reuse: bool | None, ppp: float | None, planes: float
+) -> None:
+    """Raise `ValueError` for a wish outside its range."""
+    if not 10 <= psnr <= 80:
+        raise ValueError(f"psnr: expected 10 to 80 dB, got {psnr!r}")
+    if frames < 1:
+        raise ValueError(f"frames: expected a whole number from 1 up, got {frames!r}")
+    for name, wish in (("denoise", denoise), ("reuse", reuse)):
+        if not isinstance(wish, bool | None):
+            raise ValueError(f"{name}: expected True, False or None, got {wish!r}")
+    if ppp is not None and not 0 < ppp < math.inf:
+        raise ValueError(f"ppp: expected photons per pixel above 0, or None, got {ppp!r}")
+    if not 1 <= planes < math.inf:
+        raise ValueError(f"planes: expected frames in a code from 1 up, got {planes!r}")
+
+
+def _blur(pilot: Pilot, bright: Array, allowed: Allowed, bounces: int) -> tuple[int, float, Finding]:
+    """Return `fewest_instants` of a scene that moves within its exposures; `bright` is its radiance, any shape."""
+    low, high = (float(np.percentile(bright, share)) for share in (0.1, 99.9))
+    contrast = allowed.fraction(Errors(min(high, allowed.white) - low, high - low))
+    return fewest_instants(pilot.extent, contrast, lambda k: allowed.fraction(pilot.changes(k, bounces, allowed.white)))
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What is chosen before the samples, and the error that is left to them."""
+
+    bounces: int
+    instants: int
+    frames: int
+    share: float  # of the allowed error
+    allowed: Allowed
+    noise: Noise
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """Samples, denoiser and neighbours, and the findings about them."""
+
+    chosen: Sharing
+    findings: tuple[Finding, Finding, Finding]
+
+
+def _shared_or_alone(pilot: Pilot, work: _Work, denoise: bool | None, reuse: bool | None) -> _Chosen:
+    """Return the cheapest of raw samples, denoised ones, and those that neighbouring frames share."""
+    instants = work.instants
+    strict = work.allowed.repeated
+    noise = work.noise
+    samples, about_samples = fewest_samples(noise, instants, work.allowed, work.share)
     fewer = None
     about_denoiser = Finding("denoiser", "off", "not requested")
     if denoise is not False:
         fewer, about_denoiser = denoised_samples(
-            pilot, instants, bounces, strict, share, samples, denoise, lambda n: noise.at(n / instants, instants)
+            pilot,
+            instants,
+            work.bounces,
+            strict,
+            work.share,
+            samples,
+            denoise,
+            lambda n: noise.at(n / instants, instants),
         )
     alone = Sharing(samples, 0, "")
     if fewer is not None:
         alone = Sharing(fewer[0], 0, fewer[1])
         about_samples = Finding("samples", f"{fewer[0]} per pixel, denoised", f"without: {about_samples.chosen}")
-    need = Need(strict, share, bounces, frames, alone, noise.at)
+    need = Need(strict, work.share, work.bounces, work.frames, alone, noise.at)
     chosen, about_reuse = shared_samples(pilot, need, denoise, reuse)
     if chosen is not alone:
         size = f"frames alone: {about_samples.chosen}"
         about_samples = Finding("samples", f"{chosen.samples} per pixel{', denoised' if chosen.denoise else ''}", size)
         about_denoiser = Finding("denoiser", chosen.about_denoiser, "tried on shared samples")
-    effects = (*flickering(pilot.renderer.strengths(frames), pilot.extent, instants), *_lens(scene.camera))
-    lens = (*effects, *effects_left_out(scene.camera, pilot.truths(), scene.bands))
-    pixels = scene.camera.height * scene.camera.width
-    noisy = noise.at(chosen.samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
-    about_light = _light(dimmed, noisy, bool(chosen.denoise))
-    about_motion = moving(pilot.extent, shutter)
-    shared = (limit, about_samples, about_denoiser, about_reuse)
-    findings = (*shared, about_bounces, about_light, about_motion, about_blur, *lens)
-    work = (chosen.samples, bounces, instants, instants > 1, bool(chosen.denoise))
-    errors = (left_out.plain, left_out.at_white, allowed.white, *dimmed)
-    return Budget(*work, *errors, findings, chosen.neighbours, chosen.denoise or "high")
+    return _Chosen(chosen, (about_samples, about_denoiser, about_reuse))
 
 
 def shortfall(reached: Stated | None, asked: float) -> str:

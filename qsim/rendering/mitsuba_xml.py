@@ -77,8 +77,7 @@ def read_mitsuba(
     for shape in loaded.shapes():
         if shape.interior_medium() is not None or shape.exterior_medium() is not None:
             raise ValueError(f"{path}: shape {shape.id()!r} holds a participating medium, which is not rendered here")
-        bsdf = shape.bsdf()
-        if bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and "ThinDielectric" not in str(bsdf):
+        if _has_holes(mi, shape):
             warnings.warn(
                 f"{path}: shape {shape.id()!r} has holes by its opacity; truth (flow, depth, bodies) ignores them",
                 stacklevel=2,
@@ -90,17 +89,30 @@ def read_mitsuba(
     names = [shape.id() for shape in loaded.shapes()]
     parameters = mi.traverse(loaded)
     for name in motions:
-        if name not in names:
-            meant = suggest(name, names) or f"; there are {', '.join(map(repr, names)) or 'none'}"
-            raise ValueError(f"{path}: no shape has the id {name!r}{meant}")
-        if not any(f"{name}.{key}" in parameters for key in MOVABLE):
-            raise ValueError(f"{path}: shape {name!r} has neither vertices nor a placement to move; use a mesh")
+        _check_movable(path, name, names, parameters)
     for name, flicker in (flickers or {}).items():
         _check_flicker(path, name, flicker, loaded, parameters)
     parts = tuple(Part(name, motions.get(name)) for name in names)
     camera = camera or _camera(mi, loaded, path)
     file = MitsubaFile(str(path), files.sha256(path), dict(flickers) if flickers else None)
     return Scene(path.stem, 0, camera, (), (), file=file, parts=parts, bands=None if bands is None else RGB)
+
+
+def _has_holes(mi: Any, shape: Any) -> bool:
+    """Return whether light passes through a shape by its opacity."""
+    bsdf = shape.bsdf()
+    if bsdf is None or "ThinDielectric" in str(bsdf):
+        return False
+    return bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null))
+
+
+def _check_movable(path: Path, name: str, names: list[str], parameters: Any) -> None:
+    """Raise `ValueError` if no shape has this id, or if it cannot be moved."""
+    if name not in names:
+        meant = suggest(name, names) or f"; there are {', '.join(map(repr, names)) or 'none'}"
+        raise ValueError(f"{path}: no shape has the id {name!r}{meant}")
+    if not any(f"{name}.{key}" in parameters for key in MOVABLE):
+        raise ValueError(f"{path}: shape {name!r} has neither vertices nor a placement to move; use a mesh")
 
 
 def _rejected(mi: Any, loaded: Any) -> str | None:

@@ -205,10 +205,9 @@ def denoised_samples(
     renderer = pilot.renderer
     t = pilot.middle
     camera = renderer.scene.camera
-    if renderer.engine.backend == "scalar" or not available():
-        return None, Finding("denoiser", "off", "not installed" if not available() else "needs LLVM or CUDA")
-    if wanted is None and camera.height * camera.width < AROUND**2:
-        return None, Finding("denoiser", "off", f"its error is not known well in fewer than {AROUND**2} pixels")
+    reason = _cannot_denoise(renderer, wanted)
+    if reason:
+        return None, Finding("denoiser", "off", reason)
     cheap = Finding("denoiser", "off", f"{raw} raw samples cost no more")
     least = {n: DENOISE_COST["fast" if n <= MOST_FASTER * count else "high"] for n in (count * each for each in COUNTS)}
     tried = [n for n, cost in least.items() if wanted or n + cost < raw]
@@ -243,13 +242,25 @@ def denoised_samples(
     errors = {quality: [one[quality] for one in trials if quality in one] for quality in DENOISE_COST}
     size = f"tried in {'' if len(parts) == 1 else 'four windows of '}frame {t}"
     options = _enough(tried, errors, share, count)
-    if wanted and not options:
+    if wanted and not options:  # asked for: as many samples as there may be
         size = f"{trials[-1]['high']:.2g} times the error allowed with {tried[len(trials) - 1]} samples"
         options = [(2 * count * grid_samples(MOST_DENOISED // 2), "high")]
     chosen = min(options, key=lambda option: option[0] + DENOISE_COST[option[1]], default=None)
     if chosen is None or (not wanted and chosen[0] + DENOISE_COST[chosen[1]] >= raw):
         return None, cheap
     return chosen, Finding("denoiser", f"on, {chosen[1]} quality", size)
+
+
+def _cannot_denoise(renderer: Renderer, wanted: bool | None) -> str:
+    """Return why frames of a renderer are not denoised, or nothing; `wanted` None weighs what is known of the error."""
+    if not available():
+        return "not installed"
+    if renderer.engine.backend == "scalar":
+        return "needs LLVM or CUDA"
+    camera = renderer.scene.camera
+    if wanted is None and camera.height * camera.width < AROUND**2:
+        return f"its error is not known well in fewer than {AROUND**2} pixels"
+    return ""
 
 
 def _root_mean(errors: list[float]) -> float:

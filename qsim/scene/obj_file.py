@@ -158,14 +158,7 @@ def obj_pieces(path: Path) -> list[Piece]:
                 if libraries:
                     materials.use(where, current)
             case "f":
-                corners = []
-                for word in words[1:]:
-                    corner = known.get(word) or _corner(where, word, len(vertices), len(coordinates))
-                    if "-" not in word:  # others count from the end so far
-                        known[word] = corner
-                    corners.append(corner)
-                if len(corners) < 3:
-                    raise ValueError(f"{where}: a face needs three corners, found {len(corners)}")
+                corners = _corners(where, words[1:], len(vertices), len(coordinates), known)
                 mapped = all(at >= 0 for _, at in corners)
                 fan = [(corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1)]
                 faces.setdefault((current, mapped), []).extend(fan)
@@ -186,6 +179,21 @@ def _piece(
     scale, offset = materials.placed.get(name, np.array([[1.0, 1.0], [0.0, 0.0]]))
     uv = places[pairs[:, 1]] * scale + offset if mapped else None
     return Piece(points[pairs[:, 0]], index.reshape(-1, 3).astype(np.int64), uv, materials.paints.get(name))
+
+
+def _corners(
+    where: str, words: list[str], vertices: int, coordinates: int, known: dict[str, tuple[int, int]]
+) -> list[tuple[int, int]]:
+    """Return the corners of a face, and add them to those that are `known`; `ValueError` for fewer than three."""
+    corners = []
+    for word in words:
+        corner = known.get(word) or _corner(where, word, vertices, coordinates)
+        if "-" not in word:  # others count from the end so far
+            known[word] = corner
+        corners.append(corner)
+    if len(corners) < 3:
+        raise ValueError(f"{where}: a face needs three corners, found {len(corners)}")
+    return corners
 
 
 def _corner(where: str, word: str, vertices: int, coordinates: int) -> tuple[int, int]:

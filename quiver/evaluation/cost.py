@@ -262,10 +262,8 @@ def checked_cases(
             restorer(method)
         elif method not in NETWORKS:
             load(weights_path(method))
-    for option, given, known in (("modes", modes, MODES), ("precisions", precisions, ("float32", "bfloat16"))):
-        for name in given or ():
-            if name not in known:
-                raise ValueError(f"--{option}: no {name!r}{suggest(name, known)}; known are {', '.join(known)}")
+    _check_known("modes", modes, MODES)
+    _check_known("precisions", precisions, ("float32", "bfloat16"))
     for option, value in (("modes", modes), ("precisions", precisions), ("device", device)):
         if value is not None and not networks:
             raise ValueError(f"--{option}: acts on networks, and {', '.join(methods)} is classical; leave it out")
@@ -274,6 +272,13 @@ def checked_cases(
     if networks:
         pick_device(device or "auto")
     return cases_of(methods, modes or ("exact", "streaming"), precisions or ("float32",))
+
+
+def _check_known(option: str, given: Sequence[str] | None, known: Sequence[str]) -> None:
+    """Raise `ValueError` for a name that is none of the known ones."""
+    for name in given or ():
+        if name not in known:
+            raise ValueError(f"--{option}: no {name!r}{suggest(name, known)}; known are {', '.join(known)}")
 
 
 def device_of(cases: Sequence[CostCase], wanted: str | None) -> str:

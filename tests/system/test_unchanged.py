@@ -1,7 +1,8 @@
 """What the program once computed, it still computes: codes, light, video, scores, calibrations.
 
 A failing test says that results changed. A section is stored again only after a change that was meant, and the commit
-says which: `PYTHONPATH=.:tests/support python tests/system/test_unchanged.py --write SECTION ...`. Only names that survive every move are used: `import qsim`, `quiver.restore`, and the commands.
+says which: `PYTHONPATH=.:tests/support python tests/system/test_unchanged.py --write SECTION ...`. Only names that
+survive every move are used: `import qsim`, `quiver.restore`, and the commands.
 Methods that search windows of frames are compared where their windows are complete: other frames follow the
 treatment of the ends.
 

@@ -79,63 +79,114 @@ def test_flips(tmp_path: Path):
     np.testing.assert_array_equal(everything(tmp_path / "acq_0.bin", flip="ud"), expected[:, ::-1])
 
 
+def _cube(folder: Path, planes_: np.ndarray) -> Path:
+    np.save(folder / "a.npy", np.packbits(planes_, axis=2))
+    return folder / "a.npy"
+
+
+def _codes(folder: Path, planes_: np.ndarray) -> Path:
+    np.save(folder / "a.npy", planes_.astype(bool))
+    return folder / "a.npy"
+
+
+def _light(folder: Path, planes_: np.ndarray) -> Path:
+    np.save(folder / "a.npy", planes_.astype(np.float32))
+    return folder / "a.npy"
+
+
+def _video(folder: Path, planes_: np.ndarray) -> Path:
+    pytest.importorskip("av")
+    video.write_video(folder / "a.mp4", iter(255 * planes_), 30, lossless=True)
+    return folder / "a.mp4"
+
+
+def _png(folder: Path, planes_: np.ndarray) -> Path:
+    images.write_png(folder, iter(planes_.astype(bool)))
+    return folder
+
+
+def _tiff(folder: Path, planes_: np.ndarray) -> Path:
+    pytest.importorskip("tifffile").imwrite(folder / "a.tif", planes_[0].astype(bool))
+    return folder / "a.tif"
+
+
+def _visionsim(folder: Path, planes_: np.ndarray) -> Path:
+    np.save(folder / "frames.npy", np.packbits(planes_[..., None], axis=2))
+    (folder / "transforms.json").write_text('{"w": 16, "h": 16, "c": 1, "bitpack": true, "bitpack_dim": 2}')
+    return folder
+
+
+def _zarr(folder: Path, planes_: np.ndarray) -> Path:
+    pytest.importorskip("zarr")
+    array_files.write_zarr(folder / "a.zarr", iter([planes_]), (2, 16, 16), {})
+    return folder / "a.zarr"
+
+
+def _mat(folder: Path, planes_: np.ndarray) -> Path:
+    from scipy.io import savemat
+
+    savemat(folder / "a.mat", {"OUTPUT": planes_.transpose(1, 2, 0)})
+    return folder / "a.mat"
+
+
+def _photons(folder: Path, planes_: np.ndarray) -> Path:
+    """One photon for each pixel."""
+    meta = {"format": photon_times.FORMAT, "shape": [2, 16, 16], "exposure": 1e-3, "frame_rate": 1e3}
+    first = np.arange(257)
+    kind = np.ones(256, np.uint8)
+    text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+    np.savez(folder / "a.npz", times=np.linspace(0, 1.9e-3, 256), kind=kind, first=first, meta=text)
+    return folder / "a.npz"
+
+
+def _hdf5(folder: Path, planes_: np.ndarray) -> Path:
+    with pytest.importorskip("h5py").File(folder / "a.h5", "w") as file:
+        file["entry/data"] = planes_.astype(bool)
+    return folder / "a.h5"
+
+
+def _ptu(folder: Path, planes_: np.ndarray) -> Path:
+    pytest.importorskip("ptufile").imwrite(folder / "a.ptu", np.ones((2, 4, 4, 1, 4), np.uint16), 1e-7, 1e-8)
+    return folder / "a.ptu"
+
+
+def _sdt(folder: Path, planes_: np.ndarray) -> Path:
+    pytest.importorskip("sdtfile")
+    (folder / "a.sdt").write_bytes(sdt_bytes(np.ones((1, 4, 4, 4))))
+    return folder / "a.sdt"
+
+
+def _mraw(folder: Path, planes_: np.ndarray) -> Path:
+    (folder / "a.mraw").write_bytes(bytes(2 * 16 * 16))
+    names = ("Record Rate(fps) : 1000", "Shutter Speed(s) : 1/1000", "Total Frame : 2", "Image Width : 16")
+    names += ("Image Height : 16", "Color Bit : 8", "EffectiveBit Depth : 8", "EffectiveBit Side : Lower")
+    (folder / "a.cih").write_text("\n".join((*names, "File Format : MRaw")))
+    return folder / "a.mraw"
+
+
+WRITERS = {
+    "cube": _cube,
+    "codes": _codes,
+    "light": _light,
+    "video": _video,
+    "png": _png,
+    "tiff": _tiff,
+    "visionsim": _visionsim,
+    "zarr": _zarr,
+    "mat": _mat,
+    "photons": _photons,
+    "hdf5": _hdf5,
+    "ptu": _ptu,
+    "sdt": _sdt,
+    "mraw": _mraw,
+}
+
+
 def sample(folder: Path, layout: str) -> tuple[Path, Hints]:
     """A small recording of each layout, and what has to be said to read it."""
-    planes_ = random_planes(2, 16, 16)
-    path = folder / "a.npy"
-    if layout == "cube":
-        np.save(path, np.packbits(planes_, axis=2))
-    elif layout in ("codes", "light"):
-        np.save(path, planes_.astype(bool if layout == "codes" else np.float32))
-    elif layout == "video":
-        pytest.importorskip("av")
-        path = folder / "a.mp4"
-        video.write_video(path, iter(255 * planes_), 30, lossless=True)
-    elif layout == "png":
-        path = folder
-        images.write_png(folder, iter(planes_.astype(bool)))
-    elif layout == "tiff":
-        path = folder / "a.tif"
-        pytest.importorskip("tifffile").imwrite(path, planes_[0].astype(bool))
-    elif layout == "visionsim":
-        path = folder
-        np.save(folder / "frames.npy", np.packbits(planes_[..., None], axis=2))
-        (folder / "transforms.json").write_text('{"w": 16, "h": 16, "c": 1, "bitpack": true, "bitpack_dim": 2}')
-    elif layout == "zarr":
-        pytest.importorskip("zarr")
-        path = folder / "a.zarr"
-        array_files.write_zarr(path, iter([planes_]), (2, 16, 16), {})
-    elif layout == "mat":
-        from scipy.io import savemat
-
-        path = folder / "a.mat"
-        savemat(path, {"OUTPUT": planes_.transpose(1, 2, 0)})
-    elif layout == "photons":
-        path = folder / "a.npz"
-        meta = {"format": photon_times.FORMAT, "shape": [2, 16, 16], "exposure": 1e-3, "frame_rate": 1e3}
-        # one photon for each pixel
-        first = np.arange(257)
-        kind = np.ones(256, np.uint8)
-        text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
-        np.savez(path, times=np.linspace(0, 1.9e-3, 256), kind=kind, first=first, meta=text)
-    elif layout == "hdf5":
-        path = folder / "a.h5"
-        with pytest.importorskip("h5py").File(path, "w") as file:
-            file["entry/data"] = planes_.astype(bool)
-    elif layout in ("ptu", "sdt"):
-        pytest.importorskip(f"{layout}file")
-        path = folder / f"a.{layout}"
-        if layout == "ptu":
-            pytest.importorskip("ptufile").imwrite(path, np.ones((2, 4, 4, 1, 4), np.uint16), 1e-7, 1e-8)
-        else:
-            path.write_bytes(sdt_bytes(np.ones((1, 4, 4, 4))))
-    elif layout == "mraw":
-        path = folder / "a.mraw"
-        path.write_bytes(bytes(2 * 16 * 16))
-        names = ("Record Rate(fps) : 1000", "Shutter Speed(s) : 1/1000", "Total Frame : 2", "Image Width : 16")
-        names += ("Image Height : 16", "Color Bit : 8", "EffectiveBit Depth : 8", "EffectiveBit Side : Lower")
-        (folder / "a.cih").write_text("\n".join((*names, "File Format : MRaw")))
-    else:
+    if layout in WRITERS:
+        path = WRITERS[layout](folder, random_planes(2, 16, 16))
+    else:  # bare bytes of some planes
         path = folder / "a.bin"
         path.write_bytes(bytes({"spike": 64, "mono10p": 640}.get(layout, 768 if layout.startswith("mono") else 32768)))
     size = {"height": 16, "width": 16}
