@@ -43,7 +43,7 @@ ROOT = Path(__file__).parents[1]
 FORMAT = "quiver-restorer-ablation-2"
 SEEDS = (0, 1)
 PROTOCOL = merge_training.PROTOCOLS["quick"]
-TEST_LIGHTS = tuple(Illumination("quiver-physical", ppp, bits) for bits in (1, 3, 7) for ppp in (0.5, 3.25, 26.0))
+TEST_LIGHTS = tuple(Illumination.of("quiver-physical", ppp, bits) for bits in (1, 3, 7) for ppp in (0.5, 3.25, 26.0))
 GROUPS = slice(7, 13)  # channels of merge_inputs.py
 PICTURES = slice(1, 4)
 MAPS = slice(5, 7)
@@ -170,14 +170,14 @@ def draw(kind: str, split: str, args: argparse.Namespace, size: Size, folder: Pa
         TEST_LIGHTS
         if split == "test"
         else tuple(
-            Illumination(sensor, ppp, bits)
+            Illumination.of(sensor, ppp, bits)
             for sensor in PROTOCOL["sensor"]
             for bits in PROTOCOL["bits"]
             for ppp in PROTOCOL["ppp"]
         )
     )
     if kind == "one":
-        lights = (Illumination("quiver-physical", 3.25, 3),)
+        lights = (Illumination.of("quiver-physical", 3.25, 3),)
     settings = WindowSettings(crop=size.crop, lights=lights, seed=1 if split == "test" else 0, flips=False)
     windows = Windows(clips, settings, prepare=merge_training.prepare)
     count = len(clips) * len(lights) * size.test if split == "test" else size.windows

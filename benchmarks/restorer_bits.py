@@ -88,7 +88,7 @@ def exposures(parts: Sequence[Layer], size: int, bits: int) -> Array:
 def codes_of(light: Array, ppp: float, bits: int, number: int) -> Codes:
     """Return codes of the default sensor; `light` has a mean of 1, `ppp` counts photons per plane."""
     planes = 2**bits - 1
-    device = Illumination("quiver-physical", ppp * planes, bits).device(PLANE * planes)
+    device = Illumination.of("quiver-physical", ppp * planes, bits).device(PLANE * planes)
     drawn = device.sample(light * ppp * planes, PLANE * planes, key=Key(number, bits))
     return array_codes(drawn, device, PLANE * planes)
 

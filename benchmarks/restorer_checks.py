@@ -36,7 +36,7 @@ from quiver.restoration.restorers import restorer, restorers, weights_path
 ROOT = Path(__file__).parents[1]
 RIVAL = "qbp-bm3d"
 CLASSICAL = ("naive", "moment", "transform-denoise", "qbp", RIVAL)
-SHIFTED = (Illumination("quiver-physical", 3.25, 3), Illumination("quiver-physical", 26.0, 3))
+SHIFTED = (Illumination.of("quiver-physical", 3.25, 3), Illumination.of("quiver-physical", 26.0, 3))
 SHOWN = (0.5, 3.25, 26.0, 100.0)  # photons per pixel, 3 bits
 WINDOW = 11  # frames of real photons
 SCORED = 3  # splits into those and the truth, for the scores
@@ -108,7 +108,7 @@ def crops(clip: Clip, own: str) -> Image.Image:
     """Return one frame, a row for every level of light: a code, the best rival, the restorer, the truth."""
     rows = []
     for ppp in SHOWN:
-        codes, factor = sensed(clip, Illumination("quiver-physical", ppp, 3), 0)
+        codes, factor = sensed(clip, Illumination.of("quiver-physical", ppp, 3), 0)
         peak = peak_of(mean_light(clip, factor))
         t = len(clip) // 2
         shown = {f"{ppp:g} PPP: one frame": codes.read(t, t + 1)[0] / (codes.sensor.levels - 1.0)}

@@ -56,8 +56,8 @@ class Place:
 
 def places() -> list[Place]:
     """Return all cells."""
-    qis = [Place(f"qis-{b}-{ppp:g}", Illumination("quiver-physical", ppp, b)) for b in BITS for ppp in LIGHTS]
-    spad = [(2**b - 1, Illumination("spad-320x240", ppp, b)) for b, levels in PLANES.items() for ppp in levels]
+    qis = [Place(f"qis-{b}-{ppp:g}", Illumination.of("quiver-physical", ppp, b)) for b in BITS for ppp in LIGHTS]
+    spad = [(2**b - 1, Illumination.of("spad-320x240", ppp, b)) for b, levels in PLANES.items() for ppp in levels]
     return qis + [Place(f"spad-{planes}-{light.ppp:g}", light) for planes, light in spad]
 
 

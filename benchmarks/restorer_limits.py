@@ -85,7 +85,7 @@ def moving(
 
 def codes_of(light: Array, ppp: float, draw: int) -> Codes:
     """Return 3-bit codes of light [T, H, W] seen by the sensor whose gain is that of `ppp`."""
-    sensor = Illumination("quiver-physical", ppp, 3).device(EXPOSURE)
+    sensor = Illumination.of("quiver-physical", ppp, 3).device(EXPOSURE)
     codes = array_codes(sensor.sample(light, EXPOSURE, key=Key(draw, 1)), sensor, EXPOSURE)
     return replace(codes, ppp=ppp)
 
@@ -133,7 +133,7 @@ def fields(draws: int, size: int) -> dict[str, list[list[float]]]:
     return {
         f"{bits} bit, gain of {level:g} PPP": [
             [
-                brightness(NAME, flat(Illumination(ppp=level, bits=bits), level * k, size, n), level * k)
+                brightness(NAME, flat(Illumination.of(ppp=level, bits=bits), level * k, size, n), level * k)
                 for n in range(draws)
             ]
             for k in SHARES
@@ -147,7 +147,7 @@ def planes(draws: int, size: int) -> dict[str, list[float]]:
     """Return brightness of a flat field on one binary SPAD plane, by light."""
     return {
         f"{ppp:g} PPP": [
-            brightness(NAME, flat(Illumination("spad-320x240", ppp, 1), ppp, size, n), ppp) for n in range(draws)
+            brightness(NAME, flat(Illumination.of("spad-320x240", ppp, 1), ppp, size, n), ppp) for n in range(draws)
         ]
         for ppp in PLANES
     }
@@ -157,7 +157,7 @@ def dark(draws: int, size: int) -> dict[str, list[float]]:
     """Return brightness of a flat field seen by the sensor of the published program, by method and light."""
     return {
         f"{name}, {ppp:g} PPP": [
-            brightness(name, flat(Illumination("quiver-published", ppp, 3), ppp, size, n), ppp) for n in range(draws)
+            brightness(name, flat(Illumination.of("quiver-published", ppp, 3), ppp, size, n), ppp) for n in range(draws)
         ]
         for ppp in DARK
         for name in (NAME, RIVAL)
@@ -166,7 +166,7 @@ def dark(draws: int, size: int) -> dict[str, list[float]]:
 
 def short(draws: int, size: int) -> dict[str, dict[str, Any]]:
     """Return, by frames of the stream, brightness of flat fields and the gain over the rival [dB] on what moves."""
-    lights = [Illumination(*seen) for seen in SEEN]
+    lights = [Illumination.of(*seen) for seen in SEEN]
     found = {}
     for frames in SHORT:
         streams = [moving(2.0, 3.25, size, n, frames) for n in range(draws)]

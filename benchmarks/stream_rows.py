@@ -27,7 +27,7 @@ from quiver.model.weights import metadata_of
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.restorers import restorer
 
-LIGHT = Illumination("quiver-physical", float(LIGHTS[0]), 3)
+LIGHT = Illumination.of("quiver-physical", float(LIGHTS[0]), 3)
 FRAMES = 16  # of a training window at most; a multiple of 8
 BATCH = 1  # as published: a window has 16 frames
 

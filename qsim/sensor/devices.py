@@ -299,14 +299,18 @@ def from_toml(path: str | Path, bits: int | None = None, conditions: Conditions 
 
         own = defect_table.from_toml(path)
         conditions = replace(conditions, dark=None if own is None else own.pattern.dark)
-    plain = file_laws.resolved(table, f"{path}: [sensor]", conditions)
-    sensor = from_dict(_with_gain(plain, f"{path}: [sensor]"), where=f"{path}: [sensor]")
+    sensor = of_table(table, f"{path}: [sensor]", conditions)
     known = [field.name for field in fields(sensor)]  # type: ignore[arg-type]  # every model is a dataclass
     known += [key for key in ("iso", *file_laws.KEYS) if key in table]
     for key in tables.get("sources", {}):
         if key not in known:
             raise ValueError(f"{path}: unknown key {key!r} in [sources]{suggest(key, known)}")
     return sensor
+
+
+def of_table(table: Mapping[str, object], where: str, conditions: Conditions = NOTHING) -> Sensor:
+    """Return the sensor of a table [sensor] that states its bits, with its laws (file_laws.py); `ValueError`."""
+    return from_dict(_with_gain(file_laws.resolved(table, where, conditions), where), where=where)
 
 
 def _with_gain(settings: dict[str, object], where: str) -> dict[str, object]:

@@ -93,7 +93,7 @@ def _settings(args: argparse.Namespace) -> Any:
     from quiver.evaluation.domain_measurement import CLASSICAL, DomainSettings, clips_of
 
     lights = tuple(
-        Illumination(sensor, ppp, bits)
+        Illumination.of(sensor, ppp, bits)
         for sensor in args.sensor or ("quiver-physical",)
         for bits in args.bits or (_own_bits(sensor),)
         for ppp in args.ppp or (3.25,)

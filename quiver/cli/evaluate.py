@@ -178,7 +178,7 @@ def _comparison(args: argparse.Namespace) -> Comparison:
     sensor = args.sensor or ("quiver-published" if args.published else "quiver-physical")
     own = sensor.endswith(".toml")  # the file states the bits
     lights = tuple(
-        Illumination(sensor, ppp, bits)
+        Illumination.of(sensor, ppp, bits)
         for bits in args.bits or ((None,) if own else (3,))
         for ppp in args.ppp or (3.25,)
     )
@@ -205,7 +205,7 @@ def _published_test(args: argparse.Namespace) -> Comparison:
 
     refuse_published(args)
     folder = str(args.output / CLIPS)
-    lights = tuple(Illumination("quiver-published", ppp, 3) for ppp in args.ppp or (3.25,))
+    lights = tuple(Illumination.of("quiver-published", ppp, 3) for ppp in args.ppp or (3.25,))
     return Comparison(folder, None, lights, args.seed or 0, published=True, test_set=args.protocol)
 
 

@@ -286,7 +286,7 @@ def _run_ablate(args: argparse.Namespace) -> int:
         settings, lines = one_noise(settings)
         for line in lines:
             note(line)
-        lights = tuple(noise.simple for noise in settings.noise or ())
+        lights = settings.noise or ()
         comparison = Comparison(args.data, args.split, lights, settings.seed)
         interrupted: list[int] = []
         found = run_ablation(

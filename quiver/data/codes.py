@@ -225,7 +225,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
     Codes are drawn when they are read, those of pixels followed photon by photon all at once; dead and hot pixels of
     the sensor's defects are filled.
     """
-    sensing = light.sensing(seed)
+    sensing = replace(light.sensing, seed=seed)
     draw, _ = followed(clip, sensing, light.draw(clip, seed))
     shape = clip.shape[1], clip.shape[2]
     bad = defects.of_draw(draw, clip.exposure, shape)

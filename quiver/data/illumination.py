@@ -1,60 +1,269 @@
-"""Describes at which light level a sensor sees a clip, and builds that sensor.
+"""Describes what decides the codes of a clip beside the clip and the seed: a sensor, its light and its noise.
 
-light level, sensor's name or file -> sensor, and everything that decides the codes of a clip
+    settings of `qsim sense` -> Illumination -> draw (of a clip), sensor
+    stored stream            -> Illumination, with the sensor and the defects that the stream states
+
+A training window is one exposure of one clip frame per code, all rows at once. It honours the settings in HONOURED;
+`refuse_others` refuses the rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
-from qsim.sensor import devices
+from qsim.files import sha256, to_json
+from qsim.sensor import colour_filter, devices
 from qsim.sensor.defects.defect_table import Defects, from_toml
+from qsim.sensor.defects.defect_table import from_dict as read_defects
+from qsim.sensor.file_laws import Conditions
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
+from qsim.settings import given
 from qsim.streams.clip import Clip
-from qsim.streams.sensing import Sensing, prepare
+from qsim.streams.sensing import Sensing, assemble, prepare
 from qsim.streams.simulation import Draw
+from qsim.streams.stream import Stream
+
+DEFAULT = Sensing("quiver-physical", bits=3, ppp=3.25)
+ALWAYS = ("sensor", "bits", "ppp")  # keys of every stored description
+LEVEL = (*ALWAYS, "lux")  # settings that the text of a light states in its own words
+HONOURED = (*LEVEL, "diffraction", "defects", "temperature", "pixel_pitch")
+OTHERS = "give --sensor, --bits and --ppp, in Python WindowSettings(lights=...)"  # where a stream's noise is of no use
+LONGEST = 500  # characters of a stored name
 
 
 @dataclass(frozen=True)
 class Illumination:
-    """A light level and the sensor that receives it."""
+    """A sensor, the light that it receives, and its noise."""
 
-    sensor: str = "quiver-physical"  # a named device of qsim, or a TOML file
-    ppp: float | None = 3.25  # mean photons per pixel and exposure over the clip; None = the clip's own light
-    bits: int | None = 3  # None = the device's own
+    sensing: Sensing = DEFAULT  # its seed and name are of no meaning here
+    # What a stream or a run states, as JSON; None: a named device, or a file that is read when codes are drawn
+    record: str | None = field(default=None)  # table [sensor], with the laws of its file
+    defects: str | None = field(default=None)  # table [defects]; with a record, None is no defects
 
-    def device(self, exposure: float) -> Sensor:
-        """Return the sensor for clips with this exposure [s]."""
-        return _device(self, exposure)
+    @classmethod
+    def of(
+        cls,
+        sensor: str | Sensor = DEFAULT.sensor,
+        ppp: float | None = DEFAULT.ppp,
+        bits: int | None = DEFAULT.bits,
+        **settings: Any,
+    ) -> Illumination:
+        """Return a light level [photons/pixel, None: the clip's own or `lux`] and bits [None: the sensor's own].
 
-    def sensing(self, seed: int = 0) -> Sensing:
-        """Return the same light level and sensor as settings of `qsim sense`."""
-        return Sensing(self.sensor, bits=self.bits, ppp=self.ppp, seed=seed)
-
-    def draw(self, clip: Clip, seed: int = 0) -> Draw:
-        """Return everything that decides the codes of a clip, with the defects of a sensor file. `ValueError` if it
-        does not fit the clip.
+        `settings` are others of `Sensing`, such as temperature. `ValueError` for impossible ones.
         """
-        return prepare(clip, self.sensing(seed))
+        return cls(Sensing(sensor, bits=bits, ppp=ppp, **settings))
+
+    @classmethod
+    def of_stream(cls, stream: Stream) -> Illumination:
+        """Return the light and the noise of a stored stream. `ValueError` if training windows cannot have it."""
+        refuse_others(unlike_windows(stream), str(stream.path.with_suffix(".json")))
+        meta = stream.meta
+        name = str(meta.get("sensor_name") or stream.sensor.to_dict()["model"])
+        named = "sensor_name" in meta and not name.endswith(".toml")
+        # A stream of another program states the light alone.
+        ppp = meta["ppp_target"] if "ppp_target" in meta else meta.get("ppp")
+        lux = meta.get("lux_target")
+        if lux is not None and "pixel_pitch" in meta:  # of a clip without a camera: these lux are so many photons
+            ppp = meta["ppp"]
+            lux = None
+        table = meta.get("defects")
+        return cls(
+            Sensing(name, bits=stream.bits, ppp=ppp, lux=lux, diffraction=bool(meta.get("diffraction", False))),
+            None if named else as_text(stream.sensor.to_dict()),
+            None if table is None else as_text(table),
+        )
+
+    @classmethod
+    def from_dict(cls, values: Any) -> Illumination:
+        """Return the inverse of `to_dict`; strict, `ValueError`.
+
+        The files of defect maps may be missing here: they are read when codes are drawn.
+        """
+        if not isinstance(values, dict) or not {*ALWAYS, "record", "defects"} <= set(values):
+            raise ValueError(f"noise has {', '.join(ALWAYS)}, record and defects; got {repr(values)[:100]}")
+        settings = dict(values)
+        stated = {name: settings.pop(name) for name in ("record", "defects")}
+        for name, table in stated.items():
+            if table is not None and not isinstance(table, dict):
+                raise ValueError(f"noise: {name} is {repr(table)[:100]}")
+        if not isinstance(settings["sensor"], str) or len(settings["sensor"]) > LONGEST:
+            raise ValueError(f"noise: sensor is {repr(settings['sensor'])[:100]}")
+        try:
+            sensing = Sensing(**settings)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"noise: {str(error)[:300]}") from None
+        texts = {name: None if table is None else as_text(table) for name, table in stated.items()}
+        made = cls(sensing, **texts)
+        if made.record is not None:
+            made.device(5e-4)
+        return made
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON; settings that are off are left out."""
+        values = {name: getattr(self.sensing, name) for name in ALWAYS} | given(self.sensing)
+        texts = {"record": self.record, "defects": self.defects}
+        return values | {name: None if text is None else json.loads(text) for name, text in texts.items()}
 
     @property
-    def level(self) -> str:
-        """Return light and bits as text: `3.25 PPP, 3 bit`."""
-        return ", ".join(
-            (
-                "own light" if self.ppp is None else f"{self.ppp:g} PPP",
-                "own bits" if self.bits is None else f"{self.bits} bit",
-            )
-        )
+    def sensor(self) -> str:
+        """The sensor's name or file."""
+        return self.sensing.sensor_name
+
+    @property
+    def ppp(self) -> float | None:
+        """Mean photons per pixel and exposure over the clip; None: the clip's own light, or that of `lux`."""
+        return self.sensing.ppp
+
+    @property
+    def bits(self) -> int | None:
+        """Bits per code; None: the sensor's own."""
+        return self.sensing.bits
+
+    def but(self, **changes: Any) -> Illumination:
+        """Return the same with other settings of `Sensing`."""
+        return replace(self, sensing=replace(self.sensing, **changes))
+
+    def stated(self) -> Illumination:
+        """Return the same with all that the sensor's file states, so that a run does not depend on it.
+
+        `ValueError` or `FileNotFoundError` for an unknown sensor, and for settings that training windows cannot have.
+        """
+        sensing = self.sensing
+        refuse_others([name for name in given(sensing) if name not in HONOURED], self.sensor)
+        if self.record is not None or self.defects is not None:
+            return self
+        file = sensing.sensor if isinstance(sensing.sensor, str) and sensing.sensor.endswith(".toml") else None
+        if file is not None and colour_filter.from_toml(file) is not None:
+            raise ValueError(f"{file}: training windows have one band; leave its table [colour] out")
+        table = sensing.defects or file
+        found = from_toml(table, needed=sensing.defects is not None) if isinstance(table, str) else table
+        defects = None if found is None else as_text(found.to_dict())
+        if isinstance(sensing.sensor, Sensor):
+            devices.check_known(sensing.sensor)
+            made = replace(sensing, sensor=self.sensor, bits=sensing.sensor.bits, defects=None)
+            return Illumination(made, as_text(sensing.sensor.to_dict()), defects)
+        if file is None:
+            return Illumination(replace(sensing, defects=None), None, defects)
+        bits = devices.load(file, bits=sensing.bits).bits
+        record = as_text({**_with_own_spread(file, found), "bits": bits})
+        return Illumination(replace(sensing, bits=bits, defects=None), record, defects)
+
+    def device(self, exposure: float, wavelength: float | None = None) -> Sensor:
+        """Return the sensor for codes of this exposure [s], in light of this wavelength [m, None: as cameras have]."""
+        found = None if self.defects is None else stored_defects(self.defects)
+        conditions = Conditions(self.sensing.temperature, wavelength, None if found is None else found.pattern.dark)
+        if self.record is not None:
+            return devices.of_table(json.loads(self.record), f"sensor of {self.sensor}", conditions)
+        return devices.load(self.sensing.sensor, ppp=self.ppp, bits=self.bits, exposure=exposure, conditions=conditions)
+
+    def draw(self, clip: Clip, seed: int = 0) -> Draw:
+        """Return everything that decides the codes of a clip, with the defects of the sensor. `ValueError` if it does
+        not fit the clip.
+        """
+        sensing = replace(self.sensing, seed=seed)
+        if self.record is None and self.defects is None:
+            return prepare(clip, sensing)
+        found = None if self.defects is None else stored_defects(self.defects)
+        if self.record is None:
+            return assemble(clip, sensing, found)
+        own = self.device(clip.exposure, None if clip.camera is None else clip.camera.wavelength)
+        return assemble(clip, replace(sensing, temperature=None), found, own)
+
+    @property
+    def others(self) -> list[str]:
+        """The settings beside sensor, light and bits, as text: `diffraction`, `temperature 40`."""
+        rest = {name: value for name, value in given(self.sensing).items() if name not in (*LEVEL, "seed", "name")}
+        return [name if value is True else f"{name} {value}" for name, value in rest.items()]
+
+    @property
+    def light(self) -> str:
+        """The light as text: `3.25 PPP`, `10 lx`, `own light`."""
+        if self.sensing.lux is not None:
+            return f"{self.sensing.lux:g} lx"
+        return "own light" if self.ppp is None else f"{self.ppp:g} PPP"
 
     @property
     def label(self) -> str:
-        """Return the text of tables: `3.25 PPP, 3 bit`."""
-        return self.level
+        """The text of tables: `3.25 PPP, 3 bit`."""
+        bits = "own bits" if self.bits is None else f"{self.bits} bit"
+        return ", ".join([self.light, bits, *self.others])
+
+
+def _with_own_spread(file: str, found: Defects | None) -> dict[str, Any]:
+    """Return the table [sensor] of a file. A median dark rate follows the spread of the defects; where these have none,
+    it becomes the mean by the spread that the file itself states, as in `devices.from_toml`.
+    """
+    table = dict(devices.table_of(file))
+    median = table.get("median")
+    own = from_toml(file)
+    follows = found is not None and found.pattern.dark is not None
+    if isinstance(median, float | int) and not follows and own is not None and own.pattern.dark is not None:
+        table["median"] = median * own.pattern.dark.mean
+    return table
+
+
+def unlike_windows(stream: Stream) -> list[str]:
+    """Return the settings of a stored stream that training windows cannot have."""
+    unlike = []
+    planes = stream.meta.get("planes_per_code") or 1
+    if planes != 1:
+        unlike.append(f"codes of {planes} clip frames")
+    if stream.rows is not None:
+        unlike.append("rows at their own time")
+    if stream.shares is not None:
+        unlike.append("different exposures")
+    return unlike
+
+
+def refuse_others(names: Iterable[str], where: str) -> None:
+    """Raise `ValueError` for settings that training windows cannot have, if there are any."""
+    if unlike := ", ".join(names):
+        raise ValueError(
+            f"{where}: a training window has one full exposure of one clip frame for each code, and this has {unlike}; "
+            f"{OTHERS}"
+        )
+
+
+# ---- Names in tables
+
+
+def short_name(sensor: str) -> str:
+    """Return the name of a device, or of a file without folder and suffix."""
+    return sensor.rpartition("/")[2].removesuffix(".toml")
+
+
+def labels(lights: Iterable[Illumination]) -> dict[Illumination, str]:
+    """Return the text of tables for each light: its label, and where several have one label, what tells them apart.
+
+    That is the sensor's name, the path of its file, or that it has defects. `ValueError` where none of it does.
+    """
+    found = {light: light.label for light in lights}
+    for form in (short_name, _in_its_folder, str):
+        found |= {light: f"{light.label}, {form(light.sensor)}" for light in _of_one_label(found)}
+    for light in _of_one_label(found):
+        found[light] += ", defects" if light.defects is not None else ""
+    for light in _of_one_label(found):
+        raise ValueError(f"two different lights are both called {found[light]!r} in tables; leave one of them out")
+    return found
+
+
+def _in_its_folder(sensor: str) -> str:
+    return "/".join(sensor.split("/")[-2:])
+
+
+def _of_one_label(labels: Mapping[Illumination, str]) -> list[Illumination]:
+    times = Counter(labels.values())
+    return [light for light, text in labels.items() if times[text] > 1]
+
+
+# ---- Sensors and their files
 
 
 def read_sensor(source: str | Mapping[str, Any], bits: int | None = None) -> tuple[Sensor, Defects | None]:
@@ -64,14 +273,25 @@ def read_sensor(source: str | Mapping[str, Any], bits: int | None = None) -> tup
     return devices.from_dict(source), None
 
 
+def file_digests(lights: Iterable[Illumination]) -> dict[str, str]:
+    """Return the SHA-256 of what each sensor file of the lights states, with the maps of its defects.
+
+    A light with a record states its sensor itself.
+    """
+    found: dict[str, str] = {}
+    for path in dict.fromkeys(light.sensor for light in lights if light.record is None):
+        if path.endswith(".toml"):
+            sensor, defects = read_sensor(path)
+            colour = colour_filter.from_toml(path)
+            tables = (sensor.to_dict(), defects and defects.to_dict(), colour and colour.to_dict())
+            found[path] = sha256(to_json(tables))
+    return found
+
+
 @lru_cache(maxsize=256)
 def is_known(sensor: Sensor) -> bool:
     """Return whether a sensor is of a model of qsim, not of a class of one's own."""
     return devices.is_known(sensor)
-
-
-def _device(light: Illumination, exposure: float) -> Sensor:
-    return devices.load(light.sensor, ppp=light.ppp, bits=light.bits, exposure=exposure)
 
 
 def follows_light(sensor: str) -> bool:
@@ -82,3 +302,14 @@ def follows_light(sensor: str) -> bool:
 def ideal_counter(bits: int) -> Sensor:
     """Return a sensor that counts every photon up to 2^bits - 1, for measured photon counts."""
     return QIS(quantum_efficiency=1.0, dark_current=0.0, read_noise=0.0, bits=bits)
+
+
+def as_text(values: Mapping[str, Any]) -> str:
+    """Return JSON with sorted keys."""
+    return json.dumps(values, sort_keys=True)
+
+
+@lru_cache(maxsize=64)
+def stored_defects(text: str) -> Defects:
+    """Return the defects of a table [defects] in JSON."""
+    return read_defects(json.loads(text))

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from qsim.streams.clip import Clip
 from qsim.streams.stream import Stream
-from quiver.data.illumination import Illumination
-from quiver.data.noise import Noise, as_text, short_name
+from quiver.data.illumination import Illumination, as_text, short_name, unlike_windows
 
 
 @dataclass(frozen=True)
 class Mixture:
     """The noises of which every window draws one, and a remark on the choice."""
 
-    noises: tuple[Noise, ...]
+    noises: tuple[Illumination, ...]
     remark: str = ""  # its source, if not the streams
-    streams: tuple[Noise, ...] = ()  # of the clips
+    streams: tuple[Illumination, ...] = ()  # of the clips
 
     @property
     def lines(self) -> list[str]:
@@ -44,14 +43,13 @@ def choose(
     asked = bool(sensors or ppp or bits)
     streams = _streams(clips)
     if sensors and ppp and (bits or all(map(_is_file, sensors))):  # the streams decide nothing
-        single = [stream for stream in streams if (stream.meta.get("planes_per_code") or 1) == 1]
-        streams = [stream for stream in single if stream.rows is stream.shares is None]
+        streams = [stream for stream in streams if not unlike_windows(stream)]
     found = _sorted(streams)
     if not asked:
         default = "" if found else "the default; the data set has no streams"
-        return Mixture(found or (Noise(),), default, found)
-    base = tuple(noise for noise in found if noise.sensor in (sensors or ())) or found or (Noise(),)
-    asked_for: list[Noise] = []
+        return Mixture(found or (Illumination(),), default, found)
+    base = tuple(noise for noise in found if noise.sensor in (sensors or ())) or found or (Illumination(),)
+    asked_for: list[Illumination] = []
     for sensor in sensors or (None,):
         own = tuple(noise for noise in base if noise.sensor == sensor) or base
         asked_for += [
@@ -72,44 +70,49 @@ def _is_file(sensor: str) -> bool:
     return sensor.endswith(".toml")
 
 
-def _unique(noises: Iterable[Noise]) -> tuple[Noise, ...]:
+def _unique(noises: Iterable[Illumination]) -> tuple[Illumination, ...]:
     return tuple(dict.fromkeys(noises))
 
 
-def _sorted(streams: Iterable[Stream]) -> tuple[Noise, ...]:
+def _sorted(streams: Iterable[Stream]) -> tuple[Illumination, ...]:
     """Return the noise of each stream once, in an order that does not depend on the names of streams."""
-    found = _unique(Noise.of_stream(stream) for stream in streams)
-    return tuple(sorted(found, key=lambda n: (n.sensor, n.bits or 0, n.lux or 0.0, n.ppp or 0.0, as_text(n.to_dict()))))
+    found = _unique(Illumination.of_stream(stream) for stream in streams)
+    return tuple(sorted(found, key=_place))
 
 
-def _changed(noise: Noise, sensor: str | None, ppp: float | None, bits: int | None) -> Noise:
+def _place(noise: Illumination) -> tuple[object, ...]:
+    """Return what noises are sorted by."""
+    return noise.sensor, noise.bits or 0, noise.sensing.lux or 0.0, noise.ppp or 0.0, as_text(noise.to_dict())
+
+
+def _changed(noise: Illumination, sensor: str | None, ppp: float | None, bits: int | None) -> Illumination:
     """Return a noise with the requested changes."""
     if sensor is not None and (sensor != noise.sensor or _is_file(sensor)):
         depth = bits if bits is not None or _is_file(sensor) else noise.bits
-        fresh = Noise.of(Illumination(sensor, noise.ppp, depth))
-        noise = replace(fresh, lux=noise.lux, diffraction=noise.diffraction)
+        fresh = Illumination.of(sensor, noise.ppp, depth).stated()
+        noise = fresh.but(lux=noise.sensing.lux, diffraction=noise.sensing.diffraction)
     if ppp is not None:
-        noise = replace(noise, ppp=ppp, lux=None)
+        noise = noise.but(ppp=ppp, lux=None)
     if bits is not None and bits != noise.bits:
         if noise.record is not None:
             raise ValueError(
                 f"{noise.sensor}: the file has bits = {noise.bits}, the request {bits}; change one of them"
             )
-        noise = replace(noise, bits=bits)
+        noise = noise.but(bits=bits)
     return noise
 
 
 # ---- Description
 
 
-def describe(noises: Sequence[Noise]) -> str:
+def describe(noises: Sequence[Illumination]) -> str:
     """Return the text for people: `spad-320x240, 1 bit, 1 and 10 PPP, dark-count map; quiver-physical, 3 bits, 3.25
     PPP`.
     """
     levels: dict[tuple[str, str, int | None], list[str]] = {}
     for noise in noises:
-        effects = ", ".join([*_effects(noise), *(["diffraction"] if noise.diffraction else [])])
-        levels.setdefault((short_name(noise.sensor), effects, noise.bits), []).append(_level(noise))
+        effects = ", ".join([*_effects(noise), *noise.others])
+        levels.setdefault((short_name(noise.sensor), effects, noise.bits), []).append(noise.light)
     depths: dict[tuple[str, str, tuple[str, ...]], list[int | None]] = {}
     for (sensor, effects, bits), found in levels.items():
         depths.setdefault((sensor, effects, tuple(found)), []).append(bits)
@@ -117,10 +120,6 @@ def describe(noises: Sequence[Noise]) -> str:
         ", ".join(part for part in (sensor, _bits(bits), _joined(found), effects) if part)
         for (sensor, effects, found), bits in depths.items()
     )
-
-
-def _level(noise: Noise) -> str:
-    return f"{noise.lux:g} lx" if noise.lux is not None else "own light" if noise.ppp is None else f"{noise.ppp:g} PPP"
 
 
 def _joined(levels: Sequence[str]) -> str:
@@ -141,13 +140,14 @@ def _and(words: Sequence[str]) -> str:
     return " and ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
 
 
-def _effects(noise: Noise) -> list[str]:
+def _effects(noise: Illumination) -> list[str]:
     """Return the names of the defects."""
     if noise.defects is None:
         return []
     table = json.loads(noise.defects)
     record = {} if noise.record is None else json.loads(noise.record)
-    model = record.get("model") or type(Illumination(noise.sensor, noise.ppp or 1.0, noise.bits).device(5e-4)).__name__
+    named = Illumination.of(noise.sensor, noise.ppp or 1.0, noise.bits)
+    model = record.get("model") or type(named.device(5e-4)).__name__
     dark = "dark-current" if model == "QIS" else "dark-count"
     words = {
         "dark_map": f"{dark} map",

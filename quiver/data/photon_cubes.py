@@ -53,7 +53,7 @@ def _summed(path: Path, cube: Array, light: Illumination, frame_rate: float, pla
     bits = plane_bits(planes)
     if light.bits not in (None, bits):
         raise ValueError(f"{path}: sums of {planes} planes are {bits}-bit codes, got bits = {light.bits}; leave it out")
-    sensor = replace(light, bits=bits).device(1 / frame_rate)
+    sensor = light.but(bits=bits).device(1 / frame_rate)
     if planes > 1 and not sensor.sums_planes:
         raise ValueError(
             f"{light.sensor}: only a clocked SPAD sums planes, this is a {type(sensor).__name__}; "

@@ -1,6 +1,6 @@
 """Draws the codes of one training window with the defects of its sensor, as `qsim sense` draws them.
 
-    Noise, clip, place -> window_codes
+    Illumination, clip, place -> window_codes
 
 The defects of a window are those of its place in the full frame, so a pixel has the same ones as in `qsim sense`.
 Effects that reach into a window are drawn with a margin: crosstalk of neighbours, and afterpulses of earlier frames as
@@ -23,7 +23,7 @@ from qsim.streams.photons import clip_photons
 from qsim.streams.simulation import Draw
 from quiver.data.code_table import draw_codes
 from quiver.data.defects import Filler, behind, defective, skips_codes
-from quiver.data.noise import Noise, stored_defects
+from quiver.data.illumination import Illumination, stored_defects
 
 NEGLIGIBLE = 1e-6  # chance of an afterpulse chain that is as long as the frames before a window
 
@@ -48,7 +48,7 @@ def _pixel_array(defects: str, sensor: Sensor, shape: tuple[int, int], origin: t
     return PixelArray.of(stored_defects(defects), sensor, *shape, origin)
 
 
-def check_windows(noise: Noise, clip: Clip) -> None:
+def check_windows(noise: Illumination, clip: Clip) -> None:
     """Raise `ValueError` if windows of this clip cannot be drawn one by one with this noise."""
     draw = noise.draw(clip)
     if draw.remembers:
@@ -67,7 +67,7 @@ def check_windows(noise: Noise, clip: Clip) -> None:
             )
 
 
-def behind_defects(noise: Noise, draw: Draw, clip: Clip) -> tuple[Array | None, Sensor]:
+def behind_defects(noise: Illumination, draw: Draw, clip: Clip) -> tuple[Array | None, Sensor]:
     """Return the dead and hot pixels of a clip's frames, bool [H, W] or None, and the sensor of filled codes."""
     if noise.defects is None:
         return None, draw.sensor
@@ -84,7 +84,7 @@ def window_filler(bad: Array | None, place: WindowPlace, side: int, sensor: Sens
 
 
 def window_codes(
-    noise: Noise, draw: Draw, clip: Clip, place: WindowPlace, frames: int, side: int, scale: float = 1.0
+    noise: Illumination, draw: Draw, clip: Clip, place: WindowPlace, frames: int, side: int, scale: float = 1.0
 ) -> Array:
     """Return codes [T, side, side] of a window with defects, in the order in which its frames are exposed, not turned.
 

@@ -35,7 +35,6 @@ from quiver.data.code_table import draw_codes
 from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.data.mixture import Mixture, choose
-from quiver.data.noise import Noise
 from quiver.data.window_noise import WindowPlace, behind_defects, check_windows, window_codes, window_filler
 
 # Computes inputs of a network from the codes of a window: name -> tensor, each the same shape for all windows. It runs
@@ -107,7 +106,10 @@ class Windows(Dataset[dict[str, Any]]):
         """
         check_clips(clips, settings)
         self.clips, self.settings, self.fixed, self.prepare = tuple(clips), settings, fixed, prepare
-        self.noise = choose(clips) if settings.lights is None else Mixture(tuple(map(Noise.of, settings.lights)))
+        if settings.lights is None:
+            self.noise = choose(clips)
+        else:
+            self.noise = Mixture(tuple(light.stated() for light in settings.lights))
         lit = {clip.camera is None: clip for clip in reversed(clips)}  # of clips that are alike the first
         sized = {(clip.camera is None, clip.shape[1:], clip.origin): clip for clip in reversed(clips)}  # for defects
         for noise in self.noise.noises:
@@ -294,7 +296,7 @@ def windows(
     elif isinstance(source, Stream):
         folder = source.clip
         clips = [Clip(folder.path, folder.info, folder.keeps)]
-        settings = replace(settings, lights=(Noise.of_stream(source),))
+        settings = replace(settings, lights=(Illumination.of_stream(source),))
     else:
         clips = [source] if isinstance(source, Clip) else source
     return Windows(clips, settings, repeats=repeats)

@@ -26,8 +26,7 @@ from qsim.files import read_json, write_json
 from quiver import threads
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import Codes, Stream, array_codes, sensed, stored, windows_sensed
-from quiver.data.illumination import Illumination, read_sensor
-from quiver.data.noise import file_digests, labels
+from quiver.data.illumination import Illumination, file_digests, labels, read_sensor
 from quiver.device import PeakMemory
 from quiver.evaluation import breakdown, metrics
 from quiver.evaluation.comparison_rows import ComparisonRow, append, stored_rows

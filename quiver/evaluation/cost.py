@@ -82,7 +82,7 @@ class CostRow:
 
 def fixed_clip(settings: CostSettings) -> tuple[Codes, Array]:
     """Return codes of waves and a disk that move 2 px per frame, and their photons [T, H, W]; never to be changed."""
-    sensor = Illumination(ppp=settings.ppp).device(EXPOSURE)
+    sensor = Illumination.of(ppp=settings.ppp).device(EXPOSURE)
     y, x = np.mgrid[: settings.height, : settings.width].astype(float)
     frames = []
     for t in range(settings.frames):

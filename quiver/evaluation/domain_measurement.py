@@ -21,8 +21,7 @@ from qsim.files import VERSION, Progress, to_json
 from qsim.locks import Lock
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import sensed
-from quiver.data.illumination import Illumination
-from quiver.data.noise import file_digests
+from quiver.data.illumination import Illumination, file_digests
 from quiver.evaluation import metrics
 from quiver.evaluation.comparison import in_memory
 from quiver.model.weights import annotate, metadata_of

@@ -100,7 +100,7 @@ def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: f
             raise ValueError("ppp= is for a clip that is sensed now, and a stream has its own light; leave it out")
         return codes_of(source)
     if ppp is not None:
-        return sensed(source, Illumination("quiver-physical", ppp, 3))[0]
+        return sensed(source, Illumination.of("quiver-physical", ppp, 3))[0]
     if len(source.streams) != 1:
         there = ", ".join(source.streams) or "none"
         raise ValueError(

@@ -28,7 +28,6 @@ from qsim.kinds import Bits, Number, Positive, Text
 from qsim.tables import markdown_table
 from quiver.data.codes import DARKEST, Codes, Sensor, light_of
 from quiver.data.illumination import Illumination
-from quiver.data.noise import Noise
 
 FORMAT = "quiver-domain-1"
 KEY = "domain"  # of the metadata of a weights file
@@ -201,10 +200,10 @@ def _trained(text: str | None) -> tuple[Illumination, ...]:
     try:
         settings = json.loads(text or "{}")
         if settings.get("noise"):
-            return tuple(Noise.from_dict(values) for values in settings["noise"])
+            return tuple(Illumination.from_dict(values) for values in settings["noise"])
         sensors, bits, ppp = (_listed(settings.get(name)) for name in ("sensor", "bits", "ppp"))
         return tuple(
-            Illumination(str(sensor), None if light is None else float(light), None if depth is None else int(depth))
+            Illumination.of(str(sensor), None if light is None else float(light), None if depth is None else int(depth))
             for sensor in sensors
             for depth in bits
             for light in ppp

@@ -16,7 +16,7 @@ from qsim.files import Progress
 from quiver.baselines.sliding_window import reflect
 from quiver.data.clips import peak_of
 from quiver.data.codes import Codes, frame_reader, light_of
-from quiver.data.noise import noise_table
+from quiver.data.noise_table import noise_table
 from quiver.device import moved, pick_device
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.pieces import Disagreement, cut_pieces, part_of, takes_clips, told_of_cut

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 from quiver.data.clips import Clip, open_clips
 from quiver.data.codes import Codes, codes_of, filled, light_of, open_stream, repaired, sensed, stream_codes
 from quiver.data.defects import read_map
-from quiver.data.illumination import Illumination, follows_light, read_sensor
-from quiver.data.noise import colour_filter
+from quiver.data.illumination import Illumination, colour_filter, follows_light, read_sensor
 from quiver.data.photon_cubes import cube_codes
 from quiver.restoration.interface import AUTO
 from quiver.restoration.mosaics import check_bands
@@ -96,7 +95,7 @@ def _of_clip(path: Path, args: argparse.Namespace) -> Codes:
         now = "" if args.stream else " (with --ppp the clip is sensed again)"
         refuse(args, LIGHT, f"{stream.path} is a stored stream, which has its own{now}")
         return stream_codes(stream)
-    return sensed(clip, Illumination(_sensor(args), args.ppp, _bits(args)), args.seed or 0)[0]
+    return sensed(clip, Illumination.of(_sensor(args), args.ppp, _bits(args)), args.seed or 0)[0]
 
 
 def _of_array(path: Path, args: argparse.Namespace) -> Codes:
@@ -104,7 +103,7 @@ def _of_array(path: Path, args: argparse.Namespace) -> Codes:
     refuse(args, ["seed"], f"is for noise that is drawn, and {path} holds codes already")
     if not follows_light(sensor):
         refuse(args, ["ppp"], f"{path} holds codes already, and the gain of {sensor} does not follow the light")
-    light = Illumination(sensor, args.ppp, args.bits if args.width is not None else _bits(args))
+    light = Illumination.of(sensor, args.ppp, args.bits if args.width is not None else _bits(args))
     if args.output.resolve() == path.resolve():
         raise ValueError(f"{path}: would be replaced by what is made from it; name another with -o")
     codes = cube_codes(path, light, args.frame_rate or FRAME_RATE, planes=args.planes, width=args.width)

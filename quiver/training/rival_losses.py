@@ -13,7 +13,7 @@ import torch.nn.functional as functional
 from torch import Tensor, nn
 
 from quiver.data.codes import Codes
-from quiver.data.noise import noise_table
+from quiver.data.noise_table import noise_table
 from quiver.model.blocks import RADIUS, WINDOW, resize
 from quiver.model.deformable import warp
 from quiver.model.rivals.noise import table_of

@@ -13,7 +13,6 @@ from quiver import threads
 from quiver.data.clips import open_clips
 from quiver.data.illumination import Illumination
 from quiver.data.mixture import Mixture, choose, describe
-from quiver.data.noise import Noise
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.optimiser import OPTIMISERS, Kind
 
@@ -34,7 +33,7 @@ class Settings:
     sensor: str | tuple[str, ...] | None = None  # as given; None: those of the data set's streams
     ppp: tuple[float, ...] | None = None  # light levels as given; None: those of the streams
     bits: tuple[int, ...] | None = None  # bit depths as given; None: those of the streams
-    noise: tuple[Noise, ...] | None = None  # follows from these three, set by `settled`; every window draws one
+    noise: tuple[Illumination, ...] | None = None  # follows from these three, set by `settled`; every window draws one
     crop: int = 64  # px
     frames: int = 11  # of a training window; more give more restored frames, at low cost in QUIVER
     batch: int = 8  # of each process
@@ -102,7 +101,7 @@ class Settings:
         if self.noise is not None:
             return self.noise
         return tuple(
-            Illumination(sensor, ppp, bits)
+            Illumination.of(sensor, ppp, bits)
             for sensor in self.sensors or ("quiver-physical",)
             for bits in self.bits or (3,)
             for ppp in self.ppp or (3.25,)
@@ -165,7 +164,7 @@ def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[
     return told, Mixture(noise, "as this run began", mixture.streams).lines
 
 
-def _of_files(noises: tuple[Noise, ...]) -> set[tuple[str, str | None, str | None]]:
+def _of_files(noises: tuple[Illumination, ...]) -> set[tuple[str, str | None, str | None]]:
     """Return what the sensor files among noises state; light and bits of a stored run may be those of other streams."""
     return {(noise.sensor, noise.record, noise.defects) for noise in noises if noise.sensor.endswith(".toml")}
 
@@ -174,12 +173,12 @@ def _as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _recorded(found: Mapping[str, Any]) -> tuple[Noise, ...]:
+def _recorded(found: Mapping[str, Any]) -> tuple[Illumination, ...]:
     """Return the noise of a stored run; `ValueError` if it is no list of them."""
     noises = found.get("noise")
     if not isinstance(noises, list) or not noises:
         raise ValueError(f"noise is {short(noises)}")
-    return tuple(Noise.from_dict(values) for values in noises)
+    return tuple(Illumination.from_dict(values) for values in noises)
 
 
 def portable(settings: Settings) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from quiver.data.illumination import Illumination
 
 def test_a_flat_field_has_the_light_that_it_states():
     """The gain is that of another level: codes follow the field's light."""
-    codes = restorer_limits.flat(Illumination(ppp=3.25, bits=3), 1.5, 64, 0)
+    codes = restorer_limits.flat(Illumination.of(ppp=3.25, bits=3), 1.5, 64, 0)
     table = codes.sensor.response(codes.exposure)
     mean, variance = (float(np.interp(1.5, table.photons, x)) for x in (table.mean, table.variance))
     assert_mean(codes.read(0, 11), mean, variance)
@@ -55,7 +55,7 @@ def test_patterns_slide_round_and_have_a_mean_of_one():
 
 
 def test_a_method_without_bias_is_bright_as_the_field():
-    codes = restorer_limits.flat(Illumination(ppp=3.25, bits=7), 3.25, 64, 3)
+    codes = restorer_limits.flat(Illumination.of(ppp=3.25, bits=7), 3.25, 64, 3)
     table = codes.sensor.response(codes.exposure)
     slope = float(np.interp(3.25, table.photons, np.gradient(table.mean, table.photons)))
     noise = float(np.interp(3.25, table.photons, table.variance)) / slope**2 / 3.25**2

@@ -1,7 +1,7 @@
 """Computes noise maps: the variance or deviation of codes at their mean, from the table of their sensor.
 
 A table holds the variance of codes/(2^b - 1) at equal steps of their mean from 0 to 1. Training and restoration make it
-from the exact law of the sensor (quiver/data/noise.py) and give one to each clip.
+from the exact law of the sensor (quiver/data/noise_table.py) and give one to each clip.
 """
 
 import torch

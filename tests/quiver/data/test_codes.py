@@ -47,7 +47,7 @@ def test_counting_pixels_with_a_memory_are_followed_as_by_qsim_sense(make_clip: 
     """The closed form drew them: without afterpulses, and live at the start of every exposure."""
     clip = make_clip(frames=4, height=6, width=7)
     file = sensor_file(tmp_path, COUNTER.replace("1e-5", "1e-4") + table, bits=3)
-    now = sensed(clip, Illumination(file, 3.0, None))[0]
+    now = sensed(clip, Illumination.of(file, 3.0, None))[0]
     stored = sense(clip, Sensing(file, ppp=3.0))[0]
     assert stored.meta["drawn_by"] == "events"
     np.testing.assert_array_equal(now.read(0, 4), stored.codes(0, 4))

@@ -128,7 +128,7 @@ def test_a_stream_states_its_dead_and_hot_pixels(make_clip: ClipMaker, tmp_path)
     table = "dead = 0.05\ndark = " + spread + "\n"
     clip = make_clip(frames=4, height=30, width=31)
     path = sensor_file(tmp_path, SPAD + table, bits=3)
-    now, _ = sensed(clip, Illumination(path, 3.25, 3))
+    now, _ = sensed(clip, Illumination.of(path, 3.25, 3))
     stored = stream_codes(sense(clip, Sensing(path, 3, ppp=3.25))[0])
     share = now.defective.mean()
     assert 0.08 < share < 0.22
@@ -136,7 +136,7 @@ def test_a_stream_states_its_dead_and_hot_pixels(make_clip: ClipMaker, tmp_path)
     np.testing.assert_array_equal(stored.read(0, 4), now.read(0, 4))
     assert now.read(0, 4)[:, now.defective].mean() == pytest.approx(now.read(0, 4)[:, ~now.defective].mean(), rel=0.25)
     healthy = sensor_file(tmp_path, QIS + "prnu = 0.05\n", bits=3, name="healthy.toml")
-    assert sensed(clip, Illumination(healthy, 3.25, 3))[0].defective is None
+    assert sensed(clip, Illumination.of(healthy, 3.25, 3))[0].defective is None
 
 
 def test_a_crop_has_the_defective_pixels_of_its_place(make_clip: ClipMaker, tmp_path):
@@ -145,7 +145,7 @@ def test_a_crop_has_the_defective_pixels_of_its_place(make_clip: ClipMaker, tmp_
     path = sensor_file(tmp_path, SPAD + "dead = 0.1\n", bits=3)
     stream = sense(clip, Sensing(path, 3, ppp=3.25))[0]
     whole = draw_maps(FixedPattern(dead=0.1), (26, 30)).dead
-    now, _ = sensed(clip, Illumination(path, 3.25, 3))
+    now, _ = sensed(clip, Illumination.of(path, 3.25, 3))
     earlier = replace(stream, meta={key: value for key, value in stream.meta.items() if key != "origin"})
     np.testing.assert_array_equal(now.defective, whole[6:, 9:])
     np.testing.assert_array_equal(stream_codes(stream).defective, whole[6:, 9:])
@@ -161,7 +161,7 @@ def test_hot_pixels_do_not_darken_the_others(make_clip: ClipMaker, tmp_path, mod
     np.save(tmp_path / "rates.npy", rates)
     path = sensor_file(tmp_path, model + 'dark_map = "rates.npy"\n', bits=4)
     stored = stream_codes(sense(clip, Sensing(path, None, ppp=3.0))[0])
-    now, _ = sensed(clip, Illumination(path, 3.0, None))
+    now, _ = sensed(clip, Illumination.of(path, 3.0, None))
     assert stored.sensor == now.sensor
     assert now.sensor.dark_rate == pytest.approx(20.0)
     # The variance of one code, in photons: shot noise over the efficiency, read noise and rounding
@@ -177,14 +177,14 @@ def test_a_training_window_is_filled_too(make_clip: ClipMaker, tmp_path):
     shares = []
     for dead in (0.4, 0.0):
         path = sensor_file(tmp_path, QIS + f"prnu = 0.01\ndead = {dead}\n", bits=3, name=f"dead{dead}.toml")
-        windows = Windows([clip], WindowSettings(lights=(Illumination(path, 4.0, 3),), crop=32))
+        windows = Windows([clip], WindowSettings(lights=(Illumination.of(path, 4.0, 3),), crop=32))
         shares.append(float((windows[0]["codes"] == 0).float().mean()))
     assert shares[0] < shares[1] + 0.02
 
 
 def test_a_training_window_holds_codes_of_its_sensor_alone(make_clip: ClipMaker, tmp_path):
     text = QIS.replace("read_noise = 0.2", "read_noise = 0.0\ngain = 2.0") + "dead = 0.3\n"
-    light = Illumination(sensor_file(tmp_path, text, bits=3), 2.0, 3)
+    light = Illumination.of(sensor_file(tmp_path, text, bits=3), 2.0, 3)
     window = Windows([make_clip(frames=12, height=40, width=40)], WindowSettings(lights=(light,), crop=32))[0]
     assert set(np.rint(7 * np.unique(window["codes"].numpy()))) == {0, 2, 4, 6, 7}
 

@@ -17,7 +17,6 @@ from quiver.cli.program import main
 from quiver.data.clips import open_clips
 from quiver.data.illumination import Illumination
 from quiver.data.mixture import choose, describe
-from quiver.data.noise import Noise
 from quiver.data.windows import Windows, WindowSettings
 from quiver.training.settings import Settings, settled
 
@@ -84,10 +83,10 @@ def test_a_sensor_file_brings_its_bits_and_defects(tiny_dataset, tmp_path):
 def test_what_windows_cannot_have_is_refused(make_clip: ClipMaker, tmp_path):
     counter = sensor_file(tmp_path, COUNTER + "carry_dead_time = true\n", 3)
     with pytest.raises(ValueError, match=r"carry_dead_time and afterpulse of counting pixels.*without them"):
-        Windows([make_clip()], WindowSettings(crop=16, lights=(Illumination(counter, 3.0, 3),)))
+        Windows([make_clip()], WindowSettings(crop=16, lights=(Illumination.of(counter, 3.0, 3),)))
     sums = make_clip("sums")
     sense(sums, Sensing("spad-320x240", bits=2, ppp=3.0, group=True))
-    with pytest.raises(ValueError, match="a code takes 3 clip frames, a training window one for each; give --sensor"):
+    with pytest.raises(ValueError, match=r"one full exposure .* this has codes of 3 clip frames; give --sensor"):
         choose([sums])
     assert choose([sums], ["spad-320x240"], [1.0], [2]).lines[0].startswith("noise: spad-320x240, 2 bits, 1 PPP")
     own = sensor_file(tmp_path, QIS, 4)
@@ -97,9 +96,9 @@ def test_what_windows_cannot_have_is_refused(make_clip: ClipMaker, tmp_path):
 def test_every_window_is_normalised_by_its_own_sensor(make_clip: ClipMaker):
     """Codes over their top code, targets over the white of the sensor that drew them, mixed in one batch."""
     lights = (
-        Illumination("quiver-paper", 3.0, 2),
-        Illumination("spad-320x240", 1.0, 1),
-        Illumination("quiver-physical", 9.0, 5),
+        Illumination.of("quiver-paper", 3.0, 2),
+        Illumination.of("spad-320x240", 1.0, 1),
+        Illumination.of("quiver-physical", 9.0, 5),
     )
     data = Windows([make_clip()], WindowSettings(crop=16, lights=lights, flips=False, reverse=False))
     seen = set()
@@ -132,10 +131,10 @@ def test_the_command_says_its_noise_in_one_line(data, tmp_path, capsys):
 
 def test_describe_says_every_effect():
     table = {"dark_map": "a", "gain_map": "b", "dead_map": "c", "crosstalk": 0.1, "afterpulse": 0.01}
-    noise = Noise("spad512s", 2.0, 1, defects=json.dumps(table))
+    noise = replace(Illumination.of("spad512s", 2.0, 1), defects=json.dumps(table))
     said = "spad512s, 1 bit, 2 PPP, dark-count map, gain map, map of dead pixels, crosstalk, afterpulses"
     assert describe([noise]) == said
     assert (
-        describe([replace(noise, defects=None, ppp=None, lux=5.0, diffraction=True)])
+        describe([Illumination.of("spad512s", None, 1, lux=5.0, diffraction=True)])
         == "spad512s, 1 bit, 5 lx, diffraction"
     )

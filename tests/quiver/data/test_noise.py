@@ -7,14 +7,17 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from clips import ClipMaker
 from sensor_files import QIS, sensor_file
 
-from qsim.streams.sensing import Sensing, sense
+from qsim.settings import settings_of
+from qsim.streams.sensing import Sensing, prepare, sense
 from quiver.data.clips import open_clips
-from quiver.data.illumination import Illumination
-from quiver.data.noise import Noise, labels
+from quiver.data.illumination import HONOURED, Illumination, labels
+from quiver.data.windows import Windows, WindowSettings
 from quiver.model.unet import UNet, UNetConfig
 from quiver.restoration.restorers import restorer
 from quiver.training.loop import train
@@ -30,19 +33,21 @@ def test_lights_of_one_label_get_names_that_tell_them_apart():
         return list(labels(lights).values())
 
     plain = Illumination()
-    spad = Illumination("spad-320x240")
-    assert named(plain, Illumination(ppp=9.75)) == ["3.25 PPP, 3 bit", "9.75 PPP, 3 bit"]
+    spad = Illumination.of("spad-320x240")
+    assert named(plain, Illumination.of(ppp=9.75)) == ["3.25 PPP, 3 bit", "9.75 PPP, 3 bit"]
     assert named(spad) == ["3.25 PPP, 3 bit"]
-    assert named(plain, Noise.of(spad)) == ["3.25 PPP, 3 bit", "3.25 PPP, 3 bit, spad-320x240"]
-    assert named(plain, spad, Illumination(ppp=1.0)) == [
+    assert named(plain, spad, Illumination.of(ppp=1.0)) == [
         *("3.25 PPP, 3 bit, quiver-physical", "3.25 PPP, 3 bit, spad-320x240", "1 PPP, 3 bit")
     ]
-    assert named(*(Illumination(f"{folder}/my.toml", 1.0, None) for folder in "ab")) == [
+    assert named(*(Illumination.of(f"{folder}/my.toml", 1.0, None) for folder in "ab")) == [
         *("1 PPP, own bits, a/my.toml", "1 PPP, own bits, b/my.toml")
     ]
-    noise = Noise("spad-320x240", lux=10.0)
-    assert named(noise, replace(noise, diffraction=True), replace(noise, defects="{}")) == [
-        f"10 lx, 3 bit, spad-320x240{effects}" for effects in ("", ", diffraction", ", defects")
+    noise = Illumination.of("spad-320x240", None, lux=10.0)
+    assert named(noise, noise.but(diffraction=True), noise.but(temperature=40.0), replace(noise, defects="{}")) == [
+        "10 lx, 3 bit, spad-320x240",
+        "10 lx, 3 bit, diffraction",
+        "10 lx, 3 bit, temperature 40.0",
+        "10 lx, 3 bit, spad-320x240, defects",
     ]
     with pytest.raises(ValueError, match="two different lights are both called '10 lx, 3 bit, spad-320x240, defects'"):
         labels((replace(noise, defects="{}"), replace(noise, defects='{"prnu": 0.1}')))
@@ -53,13 +58,71 @@ def test_a_sensor_file_with_colour_filters_is_refused(tmp_path):
     """Training windows have one band, and their sensor is recorded without filters."""
     file = sensor_file(tmp_path, QIS.removesuffix("[defects]\n") + '[colour]\nmask = "rggb"\n', 3)
     with pytest.raises(ValueError, match=r"mine\.toml: training windows have one band; leave its table \[colour\] out"):
-        Noise.of(Illumination(file, 3.0, 3))
+        Illumination.of(file, 3.0, 3).stated()
 
 
-# From streams and options to a mixture
+# Settings of `qsim sense`
+
+FILE = """[sensor]
+model = "QIS"
+qe_curve = [[450e-9, 0.3], [700e-9, 0.8]]
+median = 900.0
+dark_doubling = 8.0
+dark_reference = 25.0
+read_noise = 0.2
+[defects]
+dark = {{ spread = 0.4 }}
+"""
 
 
-# Defects in windows
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"temperature": 60.0},
+        {"diffraction": True},
+        {"ppp": None, "lux": 40.0},
+        {"defects": "other.toml", "temperature": 5.0},
+    ],
+    ids=str,
+)
+def test_settings_act_in_windows_as_in_sensing(make_clip: ClipMaker, tmp_path, settings):
+    """The same codes as `qsim sense` draws: other ones than without the setting."""
+    clip = make_clip()
+    file = sensor_file(tmp_path, FILE)
+    if "defects" in settings:
+        settings = settings | {"defects": sensor_file(tmp_path, QIS + "prnu = 0.2\n", name="other.toml")}
+    light = Illumination.of(file, bits=3, **settings)
+    drawn = light.stated().draw(clip, seed=5)
+    wanted = prepare(clip, replace(light.sensing, seed=5))
+    assert drawn.sensor == wanted.sensor
+    codes = drawn.frames(clip, 0, 2)
+    np.testing.assert_array_equal(codes, wanted.frames(clip, 0, 2))
+    assert (codes != Illumination.of(file, bits=3).draw(clip, seed=5).frames(clip, 0, 2)).any()
+    assert Illumination.from_dict(json.loads(json.dumps(light.stated().to_dict()))) == light.stated()
+    windows = Windows([clip], WindowSettings((light,), crop=16))
+    assert windows.noise.noises == (light.stated(),)
+
+
+def test_every_other_setting_is_refused(make_clip: ClipMaker):
+    """A setting that is new is refused until windows honour it."""
+    others = {
+        "seed": 3,
+        "name": "x",
+        "group": True,
+        "slices": 2,
+        "row_delay": 1e-6,
+        "row_order": "up",
+        "colour": "rggb",
+        "exposures": (1.0, 0.5),
+        "follow": True,
+    }
+    assert {setting.name for setting in settings_of(Sensing)} == {*others, *HONOURED}
+    clip = make_clip()
+    for name, value in others.items():
+        more = {"row_delay": 1e-6} if name == "row_order" else {}
+        light = Illumination.of(**{name: value} | more)
+        with pytest.raises(ValueError, match=f"quiver-physical: a training window has one full .* has .*{name}"):
+            Windows([clip], WindowSettings((light,), crop=16))
 
 
 # Runs
@@ -105,10 +168,10 @@ def test_a_sensor_file_that_changed_is_another_run(tiny_dataset, tmp_path):
 
 
 def test_a_run_keeps_its_mixture(data, tmp_path):
-    """Noise that the sensor files alone would not give."""
+    """Illumination that the sensor files alone would not give."""
     run = small(data, tmp_path / "r", sensor=("spad-320x240", sensor_file(tmp_path, QIS, 3)))
     begun, _ = settled(run)
-    more = (*begun.noise, replace(begun.noise[-1], ppp=7.0))
+    more = (*begun.noise, begun.noise[-1].but(ppp=7.0))
     (tmp_path / "r").mkdir()
     (tmp_path / "r/settings.json").write_text(json.dumps(replace(begun, noise=more).to_dict()))
     assert settled(run)[0].noise == more

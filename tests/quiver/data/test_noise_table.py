@@ -13,7 +13,7 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
-from quiver.data.noise import NODES, noise_table
+from quiver.data.noise_table import NODES, noise_table
 from quiver.model.rivals.noise import deviation_map, table_of, variance_at
 
 EXPOSURE = 5e-4

@@ -13,7 +13,7 @@ from quiver.data.photon_cubes import cube_codes, plane_bits
 
 VALID = [2**b - 1 for b in range(1, 17)]
 
-SPAD = Illumination("spad-320x240", None, None)
+SPAD = Illumination.of("spad-320x240", None, None)
 
 
 @pytest.mark.parametrize("planes", VALID)
@@ -69,8 +69,12 @@ def test_binary_planes_are_codes_of_one_bit(tmp_path):
 @pytest.mark.parametrize(
     ("light", "planes", "message"),
     [
-        (Illumination("spad-320x240", None, 3), 15, "sums of 15 planes are 4-bit codes, got bits = 3"),
-        (Illumination("quiver-paper", None, None), 7, "quiver-paper: only a clocked SPAD sums planes, this is a QIS"),
+        (Illumination.of("spad-320x240", None, 3), 15, "sums of 15 planes are 4-bit codes, got bits = 3"),
+        (
+            Illumination.of("quiver-paper", None, None),
+            7,
+            "quiver-paper: only a clocked SPAD sums planes, this is a QIS",
+        ),
     ],
 )
 def test_a_sensor_that_cannot_have_made_the_sums_is_refused(tmp_path, light, planes, message):
@@ -89,7 +93,7 @@ def test_an_archive_under_the_name_of_an_array_is_named(tmp_path):
 def test_photon_cubes(tmp_path, rng_planes: Array):
     """Packed planes, seven to a code; a width that is no multiple of eight; leftover planes are dropped."""
     np.save(tmp_path / "cube.npy", np.packbits(rng_planes, axis=2))
-    light = Illumination("spad-320x240", None, 3)
+    light = Illumination.of("spad-320x240", None, 3)
     codes = cube_codes(tmp_path / "cube.npy", light, 1428.0, planes=7, width=13)
     assert codes.shape == (2, 5, 13)
     np.testing.assert_array_equal(codes.read(0, 2), rng_planes[:14].reshape(2, 7, 5, 13).sum(axis=1))
@@ -97,7 +101,7 @@ def test_photon_cubes(tmp_path, rng_planes: Array):
     with pytest.raises(ValueError, match=r"is not a cube of packed planes 30 px wide"):
         cube_codes(tmp_path / "cube.npy", light, 1428.0, planes=7, width=30)
     with pytest.raises(ValueError, match="fewer than the 31 of one code"):
-        cube_codes(tmp_path / "cube.npy", Illumination("spad-320x240", None, 5), 300.0, planes=31, width=13)
+        cube_codes(tmp_path / "cube.npy", Illumination.of("spad-320x240", None, 5), 300.0, planes=31, width=13)
 
 
 @pytest.fixture

@@ -23,7 +23,6 @@ from qsim.streams.photons import clip_photons, light_level
 from quiver.data.code_table import draw_codes
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
-from quiver.data.noise import Noise
 from quiver.data.window_noise import WindowPlace, window_codes
 from quiver.data.windows import TRAINING, Windows, WindowSettings, turned
 
@@ -42,7 +41,7 @@ def random_defects(rng: random.Random, qis: bool, spad: bool) -> Defects:
     return Defects(pattern, crosstalk=0.0 if qis else some(0.1), afterpulse=some(0.2) if spad else 0.0)
 
 
-def whole_frames(noise: Noise, clip: Clip, key: Key, light: Array) -> Array:
+def whole_frames(noise: Illumination, clip: Clip, key: Key, light: Array) -> Array:
     """Codes of complete frames from the first one on, by the reference engine, as `qsim sense` stores them."""
     draw = noise.draw(clip)
     array = PixelArray.of(draw.defects, draw.plane, *clip.shape[1:])
@@ -64,8 +63,8 @@ def test_a_window_is_the_crop_of_the_sensed_frames(make_clip: ClipMaker, tmp_pat
         if found.none or (bits == 2 and not (found.crosstalk or found.afterpulse)):
             continue
         file = sensor_file(tmp_path, model, bits)
-        light = Illumination(file, rng.choice([0.3, 2.0, 20.0]), bits)
-        noise = replace(Noise.of(light), defects=json.dumps(found.to_dict()))
+        light = Illumination.of(file, rng.choice([0.3, 2.0, 20.0]), bits)
+        noise = replace(light.stated(), defects=json.dumps(found.to_dict()))
         key = Key(seed=number, clip=3, stage=TRAINING)
         place = WindowPlace(
             0, rng.randrange(12), rng.choice([0, 1, 2, 9]), rng.choice([0, 3, 4, 18]), (0, 0), 0, 0, False, key
@@ -84,7 +83,7 @@ def test_a_window_is_the_crop_of_the_sensed_frames(make_clip: ClipMaker, tmp_pat
 def test_a_window_of_a_clip_that_is_a_crop_is_that_of_its_place(make_clip: ClipMaker, tmp_path, table):
     clip = make_clip(frames=5, height=20, width=26, origin=[5, 6])
     file = sensor_file(tmp_path, (QIS if "prnu" in table else SPAD) + table)
-    noise = Noise.of(Illumination(file, 2.0, 1))
+    noise = Illumination.of(file, 2.0, 1).stated()
     draw = noise.draw(clip)
     part = window_codes(noise, draw, clip, WindowPlace(0, 1, 3, 7, (0, 0), 0, 0, False, draw.key), 3, 8)
     np.testing.assert_array_equal(part, draw.frames(clip, 1, 4)[:, 3:11, 7:15])
@@ -96,7 +95,7 @@ def test_sums_of_planes_have_the_distribution_of_their_pixels(make_clip: ClipMak
     np.save(tmp_path / "gain.npy", gain)
     file = sensor_file(tmp_path, SPAD + 'gain_map = "gain.npy"\n', 3)
     clip = make_clip(radiance=np.full((14, 20, 26), 0.5), relative=True)
-    data = Windows([clip], WindowSettings(crop=12, lights=(Illumination(file, 5.0, 3),), frames=11, flips=False))
+    data = Windows([clip], WindowSettings(crop=12, lights=(Illumination.of(file, 5.0, 3),), frames=11, flips=False))
     sums = np.zeros(3)
     counts = np.zeros(3)
     for n in range(12):
@@ -105,7 +104,7 @@ def test_sums_of_planes_have_the_distribution_of_their_pixels(make_clip: ClipMak
         for kind in range(3):
             chosen = codes[..., (np.arange(x, x + 12) % 3) == kind]
             sums[kind], counts[kind] = sums[kind] + chosen.sum(), counts[kind] + chosen.size
-    sensor = Noise.of(Illumination(file, 5.0, 3)).draw(clip).sensor
+    sensor = Illumination.of(file, 5.0, 3).stated().draw(clip).sensor
     for kind, level in enumerate((5.0, 1.25, 0.0)):
         light = np.array([level])
         spread = math.sqrt(sensor.variance(light, clip.exposure)[0] / counts[kind])
@@ -119,7 +118,7 @@ def test_a_window_is_turned_with_its_defects(make_clip: ClipMaker, tmp_path):
     np.save(tmp_path / "gain.npy", 1 - dead)
     file = sensor_file(tmp_path, QIS + 'gain_map = "gain.npy"\n', 3)
     clip = make_clip(radiance=np.full((14, 20, 26), 0.5), relative=True)
-    data = Windows([clip], WindowSettings(crop=16, lights=(Illumination(file, 60.0, 3),)))
+    data = Windows([clip], WindowSettings(crop=16, lights=(Illumination.of(file, 60.0, 3),)))
     for n in range(40):
         place = data.place(n)
         window = np.broadcast_to(dead[place.y : place.y + 16, place.x : place.x + 16], (11, 16, 16))
@@ -134,7 +133,7 @@ def test_filled_windows_are_prepared_with_the_dark_rate_of_good_pixels(make_clip
     np.save(tmp_path / "dark.npy", dark)
     file = sensor_file(tmp_path, QIS + 'dark_map = "dark.npy"\n', 3)
     clip = make_clip(radiance=np.full((14, 20, 26), 0.5), relative=True)
-    light = Illumination(file, 10.0, 3)
+    light = Illumination.of(file, 10.0, 3)
     seen = []
     data = Windows([clip], WindowSettings(crop=16, lights=(light,)), prepare=lambda codes: seen.append(codes) or {})
     data[0]
@@ -149,7 +148,7 @@ def test_resting_copies_have_the_dark_rate_of_good_pixels(make_clip: ClipMaker, 
     np.save(tmp_path / "dark.npy", dark)
     file = sensor_file(tmp_path, QIS + 'dark_map = "dark.npy"\n', 3)
     clip = make_clip(radiance=np.full((14, 20, 26), 0.5), relative=True)
-    sample = Windows([clip], WindowSettings(crop=16, lights=(Illumination(file, 3.0, 3),), still=True))[0]
+    sample = Windows([clip], WindowSettings(crop=16, lights=(Illumination.of(file, 3.0, 3),), still=True))[0]
     assert abs(7 * float(sample["still"].mean() - sample["codes"].mean())) < 0.25
 
 
@@ -159,7 +158,7 @@ def test_a_drifting_window_keeps_its_pixels(make_clip: ClipMaker, tmp_path):
     np.save(tmp_path / "dead.npy", dead)
     file = sensor_file(tmp_path, SPAD + 'dead_map = "dead.npy"\ncrosstalk = 0.1\nafterpulse = 0.1\n', 1)
     clip = make_clip(radiance=np.full((30, 48, 40), 0.5), relative=True)
-    settings = WindowSettings(crop=16, lights=(Illumination(file, 60.0, 1),), flips=False, drift=2)
+    settings = WindowSettings(crop=16, lights=(Illumination.of(file, 60.0, 1),), flips=False, drift=2)
     data = Windows([clip], settings)
     moved = 0
     noise = data.noise.noises[0]
@@ -179,7 +178,7 @@ def test_afterpulses_of_a_reversed_window_follow_its_own_time(make_clip: ClipMak
     radiance[:12] = 1.0
     clip = make_clip(radiance=radiance, relative=True)
     file = sensor_file(tmp_path, SPAD.replace("200.0", "0.0") + "afterpulse = 0.5\n", 1)
-    noise = Noise.of(Illumination(file, 20.0, 1))
+    noise = Illumination.of(file, 20.0, 1).stated()
     draw = noise.draw(clip)
     forward = window_codes(noise, draw, clip, WindowPlace(0, 8, 2, 2, (0, 0), 0, 0, False, Key(1, 2)), 11, 16)
     back = window_codes(noise, draw, clip, WindowPlace(0, 8, 2, 2, (0, 0), 0, 0, True, Key(1, 2)), 11, 16)
@@ -192,7 +191,7 @@ def test_no_defects_change_no_bit(make_clip: ClipMaker, tmp_path):
     """A sensor file without defects draws what its sensor draws, and a plain window is unchanged."""
     clip = make_clip()
     file = sensor_file(tmp_path, QIS + "prnu = 0.0\n", 3)
-    data = Windows([clip], WindowSettings(crop=16, lights=(Illumination(file, 3.25, 3),)))
+    data = Windows([clip], WindowSettings(crop=16, lights=(Illumination.of(file, 3.25, 3),)))
     place = data.place(0)
     noise = data.noise.noises[0]
     assert noise.defects is None

@@ -18,7 +18,6 @@ from qsim.streams.photons import clip_photons, light_level
 from quiver.data.clips import open_clips
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
-from quiver.data.noise import Noise
 from quiver.data.windows import Batches, Windows, WindowSettings, windows
 
 ROOT = Path(__file__).parents[3]
@@ -56,7 +55,7 @@ def test_a_sample_is_what_the_docs_say(make_clip: ClipMaker):
 
 @pytest.mark.parametrize(
     ("light", "ceiling"),
-    [(Illumination("spad-320x240", 3.0, 1), 7.5), (Illumination("spad-320x240", 21.0, 3), 7.5)],
+    [(Illumination.of("spad-320x240", 3.0, 1), 7.5), (Illumination.of("spad-320x240", 21.0, 3), 7.5)],
     ids=["a plane near saturation", "seven planes"],
 )
 def test_targets_keep_all_light_that_is_scored(make_clip: ClipMaker, light: Illumination, ceiling: float):
@@ -86,7 +85,7 @@ def test_codes_have_the_mean_of_their_photons(make_clip: ClipMaker):
 @pytest.mark.parametrize("backwards", [False, True])
 def test_turns_move_codes_and_target_together(make_clip: ClipMaker, turn: int, backwards: bool):
     """At a million photons noise is invisible: codes are the clipped target at every turn."""
-    data = three_clips(make_clip, lights=(Illumination("quiver-paper", ppp=3.25),))
+    data = three_clips(make_clip, lights=(Illumination.of("quiver-paper", ppp=3.25),))
     place = replace(data.place(0), turn=turn, backwards=backwards)
     exposed, sharp = data.photons_of(place)
     plain, _ = data.photons_of(replace(place, turn=0, backwards=False))
@@ -158,7 +157,7 @@ def test_processes_share_the_samples_without_overlap():
 
 
 def test_light_levels_are_mixed_and_named(make_clip: ClipMaker):
-    lights = (Illumination(ppp=3.25), Illumination(ppp=26.0), Illumination(ppp=3.25, bits=1))
+    lights = (Illumination.of(ppp=3.25), Illumination.of(ppp=26.0), Illumination.of(ppp=3.25, bits=1))
     data = three_clips(make_clip, lights=lights)
     found = {data.place(n).light for n in range(40)}
     assert found == {0, 1, 2}
@@ -201,7 +200,7 @@ def test_validation_windows_never_change(make_clip: ClipMaker):
 def test_fixed_windows_are_chosen_from_every_clip_and_all_light(make_clip: ClipMaker, count: int):
     """Of 3 clips at 20 levels: distinct, every clip equally often, levels at equal steps; all are in their order."""
     clips = [make_clip(f"clip_{i}", seed=i) for i in range(3)]
-    lights = tuple(Illumination(ppp=1.0 + i) for i in range(20))
+    lights = tuple(Illumination.of(ppp=1.0 + i) for i in range(20))
     data = Windows(clips, WindowSettings(lights, crop=16), fixed=True)
     chosen = data.spread(count)
     places = [data.place(n) for n in chosen]
@@ -234,12 +233,15 @@ def test_clips_that_hold_no_window_are_named(make_clip: ClipMaker):
 @pytest.mark.parametrize(
     ("noise", "message"),
     [
-        (Noise(ppp=None, lux=10.0), "photo: its radiance is relative .* has no pixel size, which lux need"),
-        (Noise(diffraction=True), "photo: diffraction needs a camera, .*; leave its data set out, or sense the other"),
+        (Illumination.of(ppp=None, lux=10.0), "photo: its radiance is relative .* has no pixel size, which lux need"),
+        (
+            Illumination.of(diffraction=True),
+            "photo: diffraction needs a camera, .*; leave its data set out, or sense the other",
+        ),
     ],
     ids=["lux", "diffraction"],
 )
-def test_noise_must_fit_clips_with_and_without_a_camera(make_clip: ClipMaker, noise: Noise, message: str):
+def test_noise_must_fit_clips_with_and_without_a_camera(make_clip: ClipMaker, noise: Illumination, message: str):
     clips = [make_clip("lit"), make_clip("photo", relative=True)]
     for order in (clips, clips[::-1]):
         with pytest.raises(ValueError, match=message):
@@ -248,7 +250,7 @@ def test_noise_must_fit_clips_with_and_without_a_camera(make_clip: ClipMaker, no
 
 def test_a_defect_map_must_cover_clips_of_every_size(make_clip: ClipMaker, tmp_path):
     np.save(tmp_path / "dead.npy", np.eye(36, 44, dtype=bool))
-    light = Illumination(sensor_file(tmp_path, QIS + 'dead_map = "dead.npy"\n', 3), 3.0, 3)
+    light = Illumination.of(sensor_file(tmp_path, QIS + 'dead_map = "dead.npy"\n', 3), 3.0, 3)
     with pytest.raises(ValueError, match="a map must cover the frames"):
         Windows([make_clip(), make_clip("tall", height=40)], WindowSettings((light,), crop=16))
 
@@ -273,7 +275,7 @@ def test_one_call_takes_streams_clips_and_folders(make_clip: ClipMaker, tiny_dat
     clip = make_clip(sharp=True)
     stream = clip.sense("spad-320x240", bits=1, ppp=1.5)
     clip.sense("quiver-paper", bits=3, ppp=9.0)
-    expected = Windows([clip], WindowSettings((Illumination("spad-320x240", 1.5, 1),), crop=16, seed=4), repeats=3)
+    expected = Windows([clip], WindowSettings((Illumination.of("spad-320x240", 1.5, 1),), crop=16, seed=4), repeats=3)
     found = windows(stream, crop=16, seed=4, repeats=3)
     assert len(found) == 3
     assert all(same(found[n], expected[n]) for n in range(5))
@@ -305,7 +307,7 @@ def test_loaders_of_the_pages_draw_new_noise_in_every_epoch(file: str):
 def test_a_scene_at_rest_has_no_motion_blur(make_clip: ClipMaker, reverse):
     """Codes of a bright scene, nearly free of noise, equal the centre frame of the target and not the exposed one."""
     clip = make_clip(sharp=True)
-    light = Illumination(sensor="quiver-physical", ppp=2e4, bits=14)
+    light = Illumination.of(sensor="quiver-physical", ppp=2e4, bits=14)
     data = Windows([clip], WindowSettings(lights=(light,), crop=16, reverse=reverse, drift=2, still=True, seed=3))
     for n in range(6):
         sample = data[n]

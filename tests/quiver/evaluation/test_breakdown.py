@@ -64,7 +64,7 @@ def test_a_clip_with_flow_has_its_error_in_the_bin_of_its_motion(make_clip: Clip
 def test_windows_with_a_factor_each_are_matched_by_their_own(make_clip: ClipMaker, tmp_path):
     """An exact answer that flickers, in published windows: after the factor of each no error is left, nor in crops."""
     clip = make_clip(flow=np.full((2, 36, 44), 1.0, np.float32))
-    comparison = Comparison(str(clip.path), None, (Illumination("quiver-published"),), published=True)
+    comparison = Comparison(str(clip.path), None, (Illumination.of("quiver-published"),), published=True)
     exact = truth(clip, sensed(clip, comparison.lights[0])[1], 0, len(clip))
 
     def restore(codes: Codes) -> Array:

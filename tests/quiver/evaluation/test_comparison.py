@@ -147,7 +147,7 @@ def test_rows_of_an_edited_sensor_file_are_not_mixed(make_clip: ClipMaker, tmp_p
     """Its numbers and maps count, not its comments."""
     np.save(tmp_path / "gain.npy", np.full((36, 44), 1.1))
     file = sensor_file(tmp_path, QIS + 'gain_map = "gain.npy"\n', 3)
-    comparison = Comparison(str(make_clip(frames=4).path), None, (Illumination(file, 3.25, None),))
+    comparison = Comparison(str(make_clip(frames=4).path), None, (Illumination.of(file, 3.25, None),))
     methods = [restorer("moment:1")]
     out = tmp_path / "t"
     rows = evaluate(comparison, methods, out)
@@ -174,7 +174,7 @@ def test_two_sensors_at_one_light_level_are_both_scored(make_clip: ClipMaker, tm
     two = sensor_file(tmp_path / "b", noisy, 3)
     clip = make_clip(frames=4)
     for sensors, named in ((("quiver-physical", "spad-320x240"),) * 2, ((one, two), ("a/mine.toml", "b/mine.toml"))):
-        lights = tuple(Illumination(sensor, 3.25, 3) for sensor in sensors)
+        lights = tuple(Illumination.of(sensor, 3.25, 3) for sensor in sensors)
         comparison = Comparison(str(clip.path), None, lights)
         out = tmp_path / Path(sensors[1]).stem
         rows = evaluate(comparison, [restorer("moment")], out)
@@ -184,7 +184,7 @@ def test_two_sensors_at_one_light_level_are_both_scored(make_clip: ClipMaker, tm
         summary.write(out, comparison, [restorer("moment")], rows)
         assert len(list(out.glob("crops_*.png"))) == 2
     with pytest.raises(ValueError, match=r"two different lights are both called '3\.25 PPP, 3 bit, quiver-physical'"):
-        Comparison(str(clip.path), None, (Illumination(), Illumination(ppp=3.25000001)))
+        Comparison(str(clip.path), None, (Illumination(), Illumination.of(ppp=3.25000001)))
 
 
 @pytest.mark.parametrize("changed", ["codes", "light"])
@@ -252,7 +252,7 @@ def test_every_sensor_is_scored_at_one_peak(make_clip: ClipMaker):
     methods = [restorer("naive"), restorer("moment:3")]
     for sensor, bits in sensors:
         ppp = float(np.exp(rng.uniform(np.log(0.3), np.log(100))))
-        rows = evaluate(Comparison(str(clip.path), None, (Illumination(sensor, ppp, bits),)), methods)
+        rows = evaluate(Comparison(str(clip.path), None, (Illumination.of(sensor, ppp, bits),)), methods)
         assert [row.failure for row in rows] == [None, None]
         assert [row.peak for row in rows] == pytest.approx([2.5 * ppp] * 2)
         light = clip.mean_radiance  # of light in units of the peak: radiance / (2.5 mean)
@@ -276,9 +276,9 @@ def test_another_peak_moves_scores_by_its_ratio(make_clip: ClipMaker):
 def test_the_published_protocol_keeps_its_white(make_clip: ClipMaker):
     """Peak = white of the sensor as published; the gain that its program derives from the light gives 2.5 times it."""
     clip = make_clip()
-    paper = Comparison(str(clip.path), None, (Illumination("quiver-paper"),), published=True)
+    paper = Comparison(str(clip.path), None, (Illumination.of("quiver-paper"),), published=True)
     assert evaluate(paper, [restorer("moment")])[0].peak == pytest.approx(7 / 0.8)
-    published = replace(paper, lights=(Illumination("quiver-published"),))
+    published = replace(paper, lights=(Illumination.of("quiver-published"),))
     assert evaluate(published, [restorer("moment")])[0].peak == pytest.approx(2.5 * 3.25)
     assert evaluate(replace(paper, peak=3.0), [restorer("moment")])[0].peak == 3.0
     assert "the sensor's white, as published" in summary.peak_name(paper)
@@ -328,7 +328,7 @@ def test_published_protocol_forces_every_window(tiny_dataset):
     assert rows[0].score.scale_spread > 0
     with pytest.raises(ValueError, match="give --ppp"):
         evaluate(
-            Comparison(str(tiny_dataset), lights=(Illumination("quiver-paper", None),), published=True),
+            Comparison(str(tiny_dataset), lights=(Illumination.of("quiver-paper", None),), published=True),
             [method("x", look)],
         )
 
@@ -357,7 +357,7 @@ def test_published_windows_of_a_sensor_with_defects_are_refused(tiny_dataset, tm
     (tmp_path / "clean.toml").write_text(text)
     (tmp_path / "worn.toml").write_text(text + "[defects]\ndead = 0.1\n")
     clean, worn = (
-        Comparison(str(tiny_dataset), lights=(Illumination(str(tmp_path / name), 3.25, None),), published=True)
+        Comparison(str(tiny_dataset), lights=(Illumination.of(str(tmp_path / name), 3.25, None),), published=True)
         for name in ("clean.toml", "worn.toml")
     )
     assert evaluate(clean, [restorer("naive")])[0].failure is None

@@ -30,7 +30,7 @@ def test_cells_are_measured_stored_and_kept(tiny_dataset, tmp_path, monkeypatch)
     path = weights(tmp_path)
     before = tensors_digest(path)
     clips = domain_measurement.clips_of([tiny_dataset], "test")
-    lights = (Illumination(ppp=3.25), Illumination("spad-320x240", 1.0, 1))
+    lights = (Illumination.of(ppp=3.25), Illumination.of("spad-320x240", 1.0, 1))
     settings = domain_measurement.DomainSettings(clips, lights, ("naive", "moment:3"))
     asked: list[Illumination] = []
     measured = domain_measurement.measure_cell
@@ -120,7 +120,7 @@ def test_cells_of_another_mode_precision_or_cut_are_not_taken(tiny_dataset, tmp_
 def test_cells_of_an_edited_sensor_file_are_not_taken(tiny_dataset, tmp_path, monkeypatch):
     path = weights(tmp_path)
     asked = cells_without_measuring(monkeypatch)
-    light = Illumination(sensor_file(tmp_path, QIS, 3), 3.25, 3)
+    light = Illumination.of(sensor_file(tmp_path, QIS, 3), 3.25, 3)
     usual = RestoreOptions(device="cpu")
     settings = DomainSettings(domain_measurement.clips_of([tiny_dataset], "test"), (light,), ("naive",))
     domain_measurement.measure(path, settings, usual)
@@ -133,7 +133,7 @@ def test_cells_of_an_edited_sensor_file_are_not_taken(tiny_dataset, tmp_path, mo
         domain_measurement.measure(path, settings, usual)
     domain_measurement.measure(path, named, usual)
     (tmp_path / "other").mkdir()
-    both = (light, Illumination(sensor_file(tmp_path / "other", QIS, 3), 3.25, 3))
+    both = (light, Illumination.of(sensor_file(tmp_path / "other", QIS, 3), 3.25, 3))
     with pytest.raises(ValueError, match="another sensor file has the same name"):
         domain_measurement.measure(path, replace(settings, lights=both), usual)
 
@@ -188,7 +188,7 @@ def test_an_infinite_score_is_refused_and_a_damaged_domain_measured_again(tiny_d
     with monkeypatch.context() as patch:
         patch.setattr(domain_measurement, "score", lambda *_: next(scores))
         clips = domain_measurement.clips_of([tiny_dataset], "test")[:1]
-        settings = DomainSettings(clips, (Illumination(ppp=3.25),), ("naive", "moment:3"))
+        settings = DomainSettings(clips, (Illumination.of(ppp=3.25),), ("naive", "moment:3"))
         with pytest.raises(ValueError, match="or has no score on these clips"):
             domain_measurement.measure(path, settings, RestoreOptions(device="cpu"))
     before = tensors_digest(path)

@@ -27,7 +27,7 @@ from quiver.restoration.restorers import restorer
 
 
 def test_the_table_holds_what_was_promised(tiny_dataset, tmp_path):
-    comparison = Comparison(str(tiny_dataset), lights=(Illumination(), Illumination(ppp=26.0)))
+    comparison = Comparison(str(tiny_dataset), lights=(Illumination(), Illumination.of(ppp=26.0)))
     methods = [restorer("naive"), restorer("moment:3")]
     rows = evaluate(comparison, methods, tmp_path / "t")
     summary.write(tmp_path / "t", comparison, methods, rows)
@@ -61,7 +61,7 @@ def test_a_method_with_a_state_uses_all_earlier_frames(make_clip: ClipMaker):
 def test_a_one_bit_sensor_in_much_light_is_not_perfect(make_clip: ClipMaker):
     """At 10 PPP every pixel lies above the white of a 1-bit code: with that as peak, every guess would be perfect."""
     comparison = Comparison(
-        str(make_clip().path), None, (Illumination("spad-320x240", 1.0, 1), Illumination("spad-320x240", 10.0, 1))
+        str(make_clip().path), None, (Illumination.of("spad-320x240", 1.0, 1), Illumination.of("spad-320x240", 10.0, 1))
     )
     dim, bright = evaluate(comparison, [restorer("moment")])
     assert bright.score.psnr < dim.score.psnr < 40

@@ -22,7 +22,6 @@ from quiver.baselines import METHODS
 from quiver.data.clips import open_clips
 from quiver.data.codes import Codes, array_codes, light_of
 from quiver.data.illumination import Illumination
-from quiver.data.noise import Noise
 from quiver.model.published_weights import convert_weights
 from quiver.model.weights import annotate, metadata_of
 from quiver.restoration import domain, interface
@@ -62,7 +61,7 @@ def test_light_that_is_not_told_is_estimated():
 def test_weights_without_cells_say_what_they_were_trained_on(tmp_path):
     path = weights(tmp_path, settings={"sensor": "quiver-physical", "bits": [1, 3], "ppp": [3.25, 9.75]})
     scope = domain.read_scope(path, metadata_of(path))
-    assert scope.trained == tuple(Illumination("quiver-physical", p, b) for b in (1, 3) for p in (3.25, 9.75))
+    assert scope.trained == tuple(Illumination.of("quiver-physical", p, b) for b in (1, 3) for p in (3.25, 9.75))
     same = domain.remark("mine", scope, stream())
     other = domain.remark("mine", scope, stream("spad512s", 2, 1))
     assert same == (
@@ -71,8 +70,9 @@ def test_weights_without_cells_say_what_they_were_trained_on(tmp_path):
     )
     assert "it was trained on quiver-physical, 1, 3 bit, 3.25, 9.75 PPP, this stream is spad512s, 1 bit" in str(other)
     assert "does not state what it was trained on" in str(domain.remark("old", Scope(), stream()))
-    own = Noise("mine.toml", 2.0, 1, record=json.dumps(devices.load("spad512s", bits=1).to_dict()), lux=None)
-    path = weights(tmp_path, settings={"sensor": None, "noise": [own.to_dict(), Noise().to_dict()]})
+    record = json.dumps(devices.load("spad512s", bits=1).to_dict())
+    own = replace(Illumination.of("mine.toml", 2.0, 1), record=record)
+    path = weights(tmp_path, settings={"sensor": None, "noise": [own.to_dict(), Illumination().to_dict()]})
     scope = domain.read_scope(path, metadata_of(path))
     assert [light.sensor for light in scope.trained] == ["mine.toml", "quiver-physical"]
     assert "trained on such streams" in str(domain.remark("mine", scope, stream("spad512s", 2, 1)))

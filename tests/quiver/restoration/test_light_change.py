@@ -22,7 +22,7 @@ LIGHTS = (
 
 
 def codes_of(light: Array, sensor: str, ppp: float, bits: int, seed: int) -> Codes:
-    device = Illumination(sensor, ppp, bits).device(5e-4)
+    device = Illumination.of(sensor, ppp, bits).device(5e-4)
     photons = light * (ppp / light.mean())
     return array_codes(device.sample(photons, 5e-4, key=Key(seed, 3)), device, 5e-4)
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from qsim.sensor.qis import QIS
 from quiver.cli.program import main
 from quiver.data.codes import Codes, array_codes
-from quiver.data.noise import noise_table
+from quiver.data.noise_table import noise_table
 from quiver.model.presets import build
 from quiver.model.rivals.edges import reflected
 from quiver.model.weights import save

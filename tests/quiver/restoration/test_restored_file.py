@@ -127,7 +127,7 @@ def test_a_restoration_of_something_else_starts_again(tmp_path, make_clip, block
             both = []
             for seed in (0, 1):
                 np.save(tmp_path / "codes.npy", random_codes(seed).read(0, 10))
-                both.append(cube_codes(tmp_path / "codes.npy", Illumination("quiver-paper", None, 3), 2000.0))
+                both.append(cube_codes(tmp_path / "codes.npy", Illumination.of("quiver-paper", None, 3), 2000.0))
                 os.unlink(tmp_path / "codes.npy")
             before, after = both
         case "sensed clip":

@@ -186,7 +186,7 @@ def test_defects_that_are_not_inverted_are_told(make_clip, tmp_path):
     path = sensor_file(tmp_path, SPAD + "crosstalk = 0.05\nafterpulse = 0.1\n")
     stream = sense(clip, Sensing(path, ppp=1.0))[0]
     bare = array_codes(stream.codes(0, 2), stream.sensor, stream.exposure)
-    now = sensed(clip, Illumination(path, 1.0, None))[0]
+    now = sensed(clip, Illumination.of(path, 1.0, None))[0]
     naive = restorer("naive")
     for codes in (stream_codes(stream), now, repaired(bare, read_sensor(path)[1])):
         assert ", crosstalk and afterpulse not inverted (restored light is too bright)," in assumed(codes, naive)

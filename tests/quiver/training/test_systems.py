@@ -18,7 +18,7 @@ from torch import Tensor
 from qsim.streams.sensing import Sensing, sense
 from quiver.data.clips import open_clips
 from quiver.data.codes import Codes
-from quiver.data.noise import noise_table
+from quiver.data.noise_table import noise_table
 from quiver.data.windows import Windows, WindowSettings
 from quiver.model.presets import NETWORKS as KINDS
 from quiver.model.presets import OTHERS, PRESETS, build
