@@ -99,7 +99,7 @@ def kind_of(wanted: Recipe) -> dict[str, int]:
 def read_shard(path: Path, wanted: dict[str, Recipe], what: str) -> dict[str, Any]:
     """Return what the clips of a shard cost and hold; `ValueError` if it is unfinished or of another recipe."""
     data = Dataset.open(path)
-    digests = {name: job["digest"] for name, job in data.meta["jobs"].items()}
+    digests = {name: job.digest for name, job in data.info.jobs.items()}
     way = next((way for way, each in wanted.items() if all(digests.get(j.name) == j.digest for j in each.jobs)), None)
     if way is None:
         raise ValueError(f"{path}: was made from another recipe than {what}")

@@ -2,6 +2,7 @@
 
     record --write--> {"format_version": 1, "checksum": SHA-256 of the other keys, field: value, ...} --read--> record
 
+A record whose class has a constant FORMAT is stored with it as key `format`: its file has no name of its own.
 Fields that hold their default are left out. Damage, another version and unknown keys are refused with the file's name.
 """
 
@@ -18,7 +19,7 @@ Made = TypeVar("Made")
 
 def values_of(record: Any) -> dict[str, Any]:
     """Return what the file of a record holds."""
-    return files.sealed({"format_version": FORMAT_VERSION} | records.plain(record))
+    return files.sealed({"format_version": FORMAT_VERSION} | _kind(type(record)) | records.plain(record))
 
 
 def write(path: Path, record: Any) -> str:
@@ -33,8 +34,21 @@ def read(path: Path, kind: type[Made], cure: str) -> Made:
 
 def of_values(path: Path, found: dict[str, Any], kind: type[Made], cure: str) -> Made:
     """Return the record in the contents of a file; errors as of `read`."""
-    files.check_version(path, found.get("format_version"), FORMAT_VERSION)
-    values = {key: value for key, value in found.items() if key not in ("format_version", "checksum")}
+    check_version(path, found)
+    expected = _kind(kind)
+    if {key: found.get(key) for key in expected} != expected:
+        raise ValueError(f"{path}: expected the format {expected['format']}, got {found.get('format')!r:.60}; {cure}")
+    values = {key: value for key, value in found.items() if key not in ("format_version", "checksum", *expected)}
     record = records.convert(values, kind, str(path), cure=cure)
     files.check_own(path, found, cure)
     return record
+
+
+def _kind(kind: Any) -> dict[str, str]:
+    """Return the key `format` of the files of a record, if its class states one."""
+    return {"format": kind.FORMAT} if hasattr(kind, "FORMAT") else {}
+
+
+def check_version(path: Path, found: dict[str, Any]) -> None:
+    """Raise `ValueError` with both versions if the contents of a file are of another format version."""
+    files.check_version(path, found.get("format_version"), FORMAT_VERSION)

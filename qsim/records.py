@@ -12,7 +12,19 @@ import dataclasses
 import re
 import types
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NotRequired,
+    Required,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
 
 import msgspec
 import numpy as np
@@ -27,7 +39,8 @@ _PART = re.compile(r"\.?(?P<name>[^.\[\]]+)|\[(?P<number>\d+|\.\.\.)\]")
 
 def convert(found: Any, kind: type[Made], where: str, *, cure: str = "") -> Made:
     """Return the record (or other type) of plain values; `ValueError` with the place, what is expected and what stands
-    there. Keys that the record lacks are refused with the one that was meant. `cure` says what to do.
+    there. Keys that the record lacks are refused with the one that was meant; a `TypedDict`, of another program's
+    values, leaves them out. `cure` says what to do.
     """
     advice = f"; {cure}" if cure else ""
     _refuse_unknown(found, kind, where, "", advice)
@@ -106,7 +119,7 @@ def _words(hint: Any) -> str:
         return "a text"
     if bare in (int, float):
         return f"{'a whole number' if bare is int else 'a number'}{_span(bounds)}"
-    if dataclasses.is_dataclass(bare) or origin is dict or bare is dict:
+    if dataclasses.is_dataclass(bare) or is_typeddict(bare) or origin is dict or bare is dict:
         return "a table of values"
     if origin is Callable:
         return "a function"
@@ -149,7 +162,7 @@ def _figure(number: float) -> str:
 
 def _bare(hint: Any) -> Any:
     """Return a type without its annotations."""
-    while get_origin(hint) is Annotated:
+    while get_origin(hint) in (Annotated, Required, NotRequired):
         hint = get_args(hint)[0]
     return hint
 
@@ -157,7 +170,7 @@ def _bare(hint: Any) -> Any:
 def _bounds(hint: Any) -> dict[str, Any]:
     """Return what the annotations of a type state: ge, gt, le, lt, min_length, max_length, pattern, and its words."""
     found: dict[str, Any] = {}
-    while get_origin(hint) is Annotated:
+    while get_origin(hint) in (Annotated, Required, NotRequired):
         inner, *notes = get_args(hint)
         for meta in notes:
             if isinstance(meta, msgspec.Meta):
@@ -221,9 +234,7 @@ def _at(path: str, hint: Any, value: Any) -> tuple[Any, Any]:
             hint = _item_hint(hint, int(number))
             continue
         value = value.get(part["name"]) if isinstance(value, Mapping) else getattr(value, part["name"])
-        hint = next(
-            (hints_of(_bare(m))[part["name"]] for m in members_of(hint) if dataclasses.is_dataclass(_bare(m))), Any
-        )
+        hint = _field_hint(hint, part["name"])
     return hint, value
 
 
@@ -236,6 +247,17 @@ def _first_misfit(hint: Any, values: Mapping[str, Any]) -> tuple[Any, Any]:
         except msgspec.ValidationError:
             return kind, value
     return hint, values
+
+
+def _field_hint(hint: Any, name: str) -> Any:
+    """Return the type of a field of a record or a typed dictionary."""
+    for member in members_of(hint):
+        bare = _bare(member)
+        if dataclasses.is_dataclass(bare):
+            return hints_of(bare)[name]
+        if is_typeddict(bare):
+            return get_type_hints(bare, include_extras=True)[name]
+    return Any
 
 
 def _misfit_key(hint: Any, values: Mapping[Any, Any]) -> str:
@@ -302,6 +324,12 @@ def _may_be_none(hint: Any) -> bool:
     if get_origin(bare) in (Union, types.UnionType):
         return any(_may_be_none(member) for member in get_args(bare))
     return bare is type(None)
+
+
+def is_of_files(member: Any) -> bool:
+    """Return whether one alternative of a type is a plain value, as TOML and JSON hold it."""
+    bare = _bare(member)
+    return get_origin(bare) is not None or _is_plain(bare)
 
 
 def _is_plain(kind: type) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import operator
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass
 from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
@@ -62,6 +63,7 @@ class Setting:
     shown: str
     varied: bool
     recipe: bool
+    meta: Meta  # the declaration
 
     @property
     def required(self) -> bool:
@@ -102,7 +104,7 @@ def settings_of(kind: Any) -> tuple[Setting, ...]:
         default = field.default if field.default_factory is MISSING else field.default_factory()
         extra = dict(declared.extra or {})
         extra["option"] = extra["option"] or field.name.replace("_", "-")
-        found.append(Setting(field.name, hint, default, declared.description or "", **extra))
+        found.append(Setting(field.name, hint, default, declared.description or "", **extra, meta=declared))
     return tuple(found)
 
 
@@ -137,6 +139,37 @@ def taking(
         return called
 
     return wrapped
+
+
+def section_of(name: str, kind: Any, own: Any, *, needed: tuple[str, ...] = ()) -> Any:
+    """Return the record of a section of a recipe: the keys of the record `own`, and the settings of `kind`.
+
+    Settings are optional, but those that are `needed`; None is one that is not given. A varied one may be a list.
+    Objects that no file holds are left out of its types.
+    """
+    required: list[Any] = []
+    optional: list[Any] = []
+    taken = set(records.hints_of(own))
+    for declared in settings_of(kind):
+        if not declared.recipe or declared.name in taken:
+            continue
+        hint = _of_files(declared.hint)
+        if declared.varied:
+            hint = hint | Annotated[tuple[hint, ...], Meta(min_length=1)]  # type: ignore[valid-type]
+        if declared.name in needed:
+            required.append((declared.name, Annotated[hint, declared.meta]))
+        else:
+            optional.append((declared.name, Annotated[hint | None, declared.meta], None))
+    made = dataclasses.make_dataclass(name, [*required, *optional], bases=(own,), frozen=True, kw_only=True)
+    made.__module__ = own.__module__
+    made.__doc__ = own.__doc__
+    return made
+
+
+def _of_files(hint: Any) -> Any:
+    """Return the alternatives of a type that files hold."""
+    found = [member for member in records.members_of(hint) if records.is_of_files(member)]
+    return functools.reduce(operator.or_, found)
 
 
 def _declaration(hint: Any) -> Meta | None:

@@ -15,6 +15,7 @@ from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
 from qsim.formats.recording import Recording
+from qsim.restored_video import describes_restored
 from qsim.streams.clip import Clip
 from qsim.streams.stream import Stream
 
@@ -221,7 +222,7 @@ def _restored(source: Path) -> dict[str, Any]:
     """Return the description of restored video (`quiver restore`), which states its rates; else an empty one."""
     beside = source.with_suffix(".json")
     found = files.read_json(beside) if source.suffix == ".npy" and beside.is_file() else {}
-    return found if "seconds_per_frame" in found else {}
+    return found if describes_restored(found) else {}
 
 
 def _size(made: Clip | Stream) -> str:

@@ -13,8 +13,9 @@ from qsim import checks
 from qsim.cli import documented_keys
 from qsim.cli.console import PILOT, RESUMES, bar, command, note, output
 from qsim.cli.options import checked, part_of
-from qsim.dataset.job import Job, Settings
+from qsim.dataset.job import Job
 from qsim.dataset.recipe import Recipe
+from qsim.rendering.render_settings import RenderSettings
 
 
 def add_generate(sub: Any) -> None:
@@ -81,9 +82,14 @@ def _empty(wanted: Recipe, chosen: Sequence[Job]) -> list[str]:
 
 def _defaults(wanted: Recipe) -> str:
     """Return the defaults that a recipe does not set: `; by default frame_rate = 2000, shutter = 0`."""
-    sections = [wanted.source["recipe"], *wanted.source["scenes"]]
-    settings = {"frame_rate": 2000.0, "shutter": Settings.shutter, "psnr": Settings.psnr, "seed": 0}
-    taken = [f"{key} = {value:g}" for key, value in settings.items() if not any(key in part for part in sections)]
+    source = wanted.source
+    assert source is not None
+    taken = [
+        f"{name} = {getattr(RenderSettings, name):g}"
+        for name in ("frame_rate", "shutter", "psnr")
+        if all(getattr(part, name) is None for part in (source.recipe, *source.scenes))
+    ]
+    taken += ["seed = 0"] if source.recipe.seed is None else []
     return f"; by default {', '.join(taken)}" if taken else ""
 
 
@@ -247,21 +253,21 @@ def add_check(sub: Any) -> None:
 
 
 def _run_check(args: argparse.Namespace) -> int:
-    from qsim.dataset import checking, redraw
+    from qsim.dataset import checking
 
     problems: list[str] = []
-    again: list[redraw.Redrawn] = []
+    again: list[checking.Redrawn] = []
     for path in args.paths:
         with bar(str(path), "clip" if (path / "dataset.json").is_file() else "file") as progress:
             problems += checking.check(path, progress)
         if args.redraw:
             with bar(f"{path} again", "stream") as progress:
-                again += redraw.redraw(path, progress)
+                again += checking.redraw(path, progress)
     names = ", ".join(str(path) for path in args.paths)
     facts: dict[str, Any] = {"paths": [str(path) for path in args.paths], "problems": problems}
     lines = checking.lines(problems, names)
     if args.redraw:
         facts["redrawn"] = [dataclasses.asdict(one) | {"path": str(one.path), "wrong": one.wrong} for one in again]
-        lines += redraw.lines(again)
+        lines += checking.redrawn_lines(again)
     output(args, facts, lines)
     return 1 if problems or any(one.wrong for one in again) else 0

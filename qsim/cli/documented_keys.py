@@ -1,6 +1,6 @@
 """Lists the keys of recipes and sensor files: what each accepts, an example, and its meaning.
 
-Keys and what they accept come from the checks that read the files, or from the fields of a sensor. Examples and
+Keys and what they accept come from the records that the files are read into. Examples and
 meanings come from the commented file in the docstring of the module that reads it, or from the comments of the fields.
 """
 
@@ -15,8 +15,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from typing import Any, NamedTuple
 
+from qsim import records
 from qsim.settings import settings_of
-from qsim.structure import table_of
 from qsim.tables import text_table
 
 
@@ -25,21 +25,21 @@ class Section(NamedTuple):
 
     commented_in: str  # its docstring shows the section as a commented file
     checked_in: str = ""
-    name: str = ""  # of the checks; "": none, the commented lines are the keys
+    name: str = ""  # of the record; "": none, the commented lines are the keys
 
 
 _RECIPE = "qsim.dataset.recipe"
-_SECTIONS = "qsim.dataset.recipe_sections"
+_RECORDS = "qsim.dataset.recipe_file"
 _DEFECTS = "qsim.sensor.defects.defect_table"
 RECIPE = {
-    "[recipe]": Section(_RECIPE, _RECIPE, "HEAD"),
-    "[[scenes]]": Section(_RECIPE, f"{_SECTIONS}.scenes_section", "SCENES"),
-    "[[streams]]": Section(_RECIPE, f"{_SECTIONS}.streams_section", "STREAMS"),
+    "[recipe]": Section(_RECIPE, _RECORDS, "Head"),
+    "[[scenes]]": Section(_RECIPE, _RECORDS, "ScenesSection"),
+    "[[streams]]": Section(_RECIPE, _RECORDS, "StreamsSection"),
 }
 SENSOR_FILE = {
     "[sensor]": Section("qsim.sensor.file_laws"),
     "[sources]": Section("qsim.sensor.file_laws"),
-    "[defects]": Section(_DEFECTS, _DEFECTS, "TABLE"),
+    "[defects]": Section(_DEFECTS, _DEFECTS, "DefectKeys"),
     "[colour]": Section("qsim.sensor.colour_filter"),
 }
 SECTIONS = RECIPE | SENSOR_FILE
@@ -69,19 +69,20 @@ def keys(section: str) -> list[Key]:
         return [Key(name, False, "", *found) for name, found in examples.items()]
     if section in RECIPE:
         examples = commented(text, "[recipe]") | examples  # [[scenes]] may repeat keys of [recipe]
-    return [
-        Key(entry.removesuffix(", if any"), ", if any" not in entry, accepted(check), *examples[entry.split(",")[0]])
-        for entry, check in flat(getattr(import_module(where.checked_in), where.name))
-    ]
+    record = getattr(import_module(where.checked_in), where.name)
+    return [Key(name, needed, accepts, *examples[name]) for name, needed, accepts in flat(record)]
 
 
-def flat(checks: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield (entry, check) of a table and of the tables in it, with dotted keys."""
-    for entry, check in checks.items():
-        if isinstance(check, Mapping):
-            yield from flat(check, f"{above}{entry.removesuffix(', if any')}.")
+def flat(record: Any, above: str = "") -> Iterator[tuple[str, bool, str]]:
+    """Yield name, whether it is needed, and what is accepted, of the keys of a record and of the records in it."""
+    hints = records.hints_of(record)
+    for field in dataclasses.fields(record):
+        inner = [member for member in records.members_of(hints[field.name]) if dataclasses.is_dataclass(member)]
+        if inner:
+            yield from flat(inner[0], f"{above}{field.name}.")
         else:
-            yield above + entry, check
+            needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+            yield above + field.name, needed, records.words_of(hints[field.name])
 
 
 def commented(text: str, section: str) -> dict[str, tuple[str, str]]:
@@ -102,16 +103,6 @@ def commented(text: str, section: str) -> dict[str, tuple[str, str]]:
     return found
 
 
-def accepted(check: Any) -> str:
-    """Return what a check expects, in the words of its message about values that it refuses."""
-    for refused in (1e30, object()):  # beyond every limit; of no kind that TOML has
-        try:
-            check(refused)
-        except ValueError as error:
-            return str(error).removeprefix("expected ").partition(", got")[0]
-    return ""
-
-
 # ---- Fields of sensors
 
 
@@ -123,13 +114,12 @@ def model_keys(model: str) -> list[Key]:
     comments = fields_of(kind)
     defaults = {field.name: field.default for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     found = [Key("model", True, "the name of a model", f'"{model}"', str(kind.__doc__).partition("\n")[0])]
-    for entry, check in table_of(kind).items():
-        name = entry.removesuffix(", if any")
-        needed = name == entry and name != "bits"  # a file without bits serves every depth
+    for name, required, accepts in flat(kind):
+        needed = required and name != "bits"  # a file without bits serves every depth
         default = defaults[name]
         stated = "" if needed or default in (None, dataclasses.MISSING) else f"default {str(default).lower()}"
         meaning = "; ".join(part for part in (comments[name], stated) if part)
-        found.append(Key(name, needed, accepted(check), "", meaning))
+        found.append(Key(name, needed, accepts, "", meaning))
     return found
 
 

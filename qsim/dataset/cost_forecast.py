@@ -209,7 +209,7 @@ def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
     """
     looked_at = evenly_spaced(members)
     budgets, choosing = zip(*map(_budget, looked_at), strict=True)
-    size = (members[0].settings.height, members[0].settings.width)
+    size = members[0].settings.size
     work = [Sharing.of(budget).cost(math.prod(size)) for budget in budgets]
     typical = Seconds(*map(median, zip(*choosing, strict=True)))  # the first of a process also imports
     middle = len(looked_at) // 2

@@ -11,24 +11,17 @@ import errno
 import os
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
-from qsim import files, scratch
-from qsim.dataset.dataset import FORMAT_VERSION, Damaged, Dataset, unproven
+from qsim import descriptions, files, scratch
+from qsim.clip.manifest import read_info
+from qsim.dataset.checking import repair_jobs
+from qsim.dataset.dataset import Damaged, Dataset, DatasetInfo
 from qsim.dataset.job import Job
-from qsim.dataset.job_runner import (
-    FOLDERS,
-    RenderJob,
-    Result,
-    failure_path,
-    mark_failed,
-    record_path,
-    render_job,
-)
+from qsim.dataset.job_record import Failure, JobInfo, failure_path, read_record, record_path, unproven
+from qsim.dataset.job_runner import FOLDERS, RenderJob, Result, mark_failed, render_job
 from qsim.dataset.recipe import Recipe
-from qsim.dataset.repair import repair_jobs
 from qsim.dataset.worker_pool import Limits, run_here, run_local
 from qsim.files import VERSION, Progress
 from qsim.locks import Lock
@@ -162,22 +155,14 @@ def write_manifest(recipe: Recipe, folder: Path) -> None:
         jobs = {}
         failures = _failures(folder, recipe.jobs)
         for job in recipe.jobs:
-            entry: dict[str, Any] = {"split": job.split, "scene": job.scene, "digest": job.digest, "state": "missing"}
+            listed = JobInfo(split=job.split, scene=job.scene, digest=job.digest)
             if record_path(folder, job.name).is_file():
-                entry |= {"state": "done", "record": files.sha256(record_path(folder, job.name))}
+                listed = replace(listed, state="done")
             elif job.name in failures:
-                entry |= {"state": "failed", "error": failures[job.name]}
-            jobs[job.name] = entry
-        manifest = {
-            "format_version": FORMAT_VERSION,
-            "name": recipe.name,
-            "recipe": recipe.source,
-            "splits": recipe.splits,
-            "jobs": jobs,
-            "complete": all(entry["state"] == "done" for entry in jobs.values()),
-            "software": {"qsim": VERSION},
-        }
-        files.write_description(folder / "dataset.json", manifest)
+                listed = replace(listed, state="failed", error=failures[job.name])
+            jobs[job.name] = listed
+        info = DatasetInfo(name=recipe.name, recipe=recipe.source, jobs=jobs, software={"qsim": VERSION})
+        descriptions.write(folder / "dataset.json", info)
 
 
 def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
@@ -191,7 +176,7 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
         write_manifest(recipe, folder)
         return ()
     try:
-        old = Dataset.open(folder).meta["jobs"]
+        old = Dataset.open(folder).info.jobs
     except Damaged as error:
         if not repair:
             raise
@@ -202,12 +187,12 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
     for job in recipe.jobs:
         if job.name not in old:
             raise ValueError(f"{folder}: was made from another recipe, without the clip {job.name}; use another folder")
-        if old[job.name]["digest"] != job.digest and _is_made(folder, job):
+        if old[job.name].digest != job.digest and _is_made(folder, job):
             raise ValueError(f"{folder}: its clip {job.name} was made with other settings; use another folder")
     extra = sorted(set(old) - {job.name for job in recipe.jobs})
     if extra:
         raise ValueError(f"{folder}: holds the clip {extra[0]}, which is not in this recipe; use another folder")
-    if any(old[job.name]["digest"] != job.digest for job in recipe.jobs):  # edited before their clips were made
+    if any(old[job.name].digest != job.digest for job in recipe.jobs):  # edited before their clips were made
         write_manifest(recipe, folder)
     return ()
 
@@ -226,12 +211,11 @@ def _check_reads(recipe: Recipe, folder: Path) -> None:
         if not Path(job.family).is_absolute():
             continue
         for about in (folder / "clips" / job.name / "clip.json", folder / "work" / job.name / "clip.json"):
-            read = None
+            reads: dict[str, str] = {}
             with contextlib.suppress(OSError, ValueError):  # missing or damaged: a check finds it
-                read = files.read_json(about).get("reads")
-            entries = read.items() if isinstance(read, dict) else ()
-            for name, digest in sorted(entries, key=lambda entry: "*" in entry[0]):  # single files first
-                key = (job.family, name, str(digest))
+                reads = read_info(about).reads
+            for name, digest in sorted(reads.items(), key=lambda entry: "*" in entry[0]):  # single files first
+                key = (job.family, name, digest)
                 problem = None if key in seen else scene_files.change(*key)
                 seen.add(key)
                 if problem:
@@ -249,11 +233,11 @@ def _check_records(recipe: Recipe, folder: Path, repair: bool) -> None:
     digests = {}
     for path in (folder / "jobs").glob("*.json"):
         with contextlib.suppress(ValueError):
-            digests[path.stem] = files.read_json(path).get("digest")
+            digests[path.stem] = read_record(path).digest
     asked = [job for job in recipe.jobs if job.name in digests]
     if digests and not any(digests[job.name] == job.digest for job in asked):
         raise ValueError(f"{folder}: none of its {len(digests)} finished clips is of this recipe; use another folder")
-    other = [job.name for job in asked if isinstance(digests[job.name], str) and digests[job.name] != job.digest]
+    other = [job.name for job in asked if digests[job.name] != job.digest]
     if other and not repair:
         raise ValueError(
             f"{folder}: its clip {other[0]} was made with other settings; use another folder, or --repair to make it "
@@ -301,9 +285,9 @@ def _failures(folder: Path, jobs: Sequence[Job]) -> dict[str, str]:
             path.unlink(missing_ok=True)
         elif path.is_file():
             try:
-                note = files.read_json(path)
-                if note.get("digest", job.digest) == job.digest:
-                    found[job.name] = str(note.get("error", f"{path}: does not say why"))
+                note = descriptions.read(path, Failure, "add --retry")
+                if note.digest == job.digest:
+                    found[job.name] = note.error
             except ValueError as error:
                 found[job.name] = files.wording(error)
     return found

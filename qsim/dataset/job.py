@@ -2,35 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from qsim import files
+from qsim import files, records
 from qsim.files import to_json
 from qsim.kinds import Split
+from qsim.rendering.render_settings import RenderSettings
 from qsim.sensor.defects import defect_table
+from qsim.settings import given
 from qsim.streams.sensing import Sensing
-
-FRAME_RATE = 2000.0  # Hz, unless a recipe states another
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings that a clip is rendered with."""
-
-    frames: int
-    height: int  # pixels
-    width: int  # pixels
-    frame_rate: float  # Hz
-    shutter: float = 0.0  # open share of a frame, 0..1
-    psnr: float = 40.0  # wanted error of the radiance, dB below white
-    bands: str | None = None  # "rgb": in colour
-    camera_path: str | None = None  # absolute path of a transforms.json
-    reuse: bool | None = None  # whether frames share samples with their neighbours; None: where a trial costs little
 
 
 @dataclass(frozen=True)
@@ -42,7 +25,7 @@ class Job:
     scene_seed: int
     speed: float  # factor on all motions
     split: Split
-    settings: Settings
+    settings: RenderSettings
     seed: int  # of the samples
     streams: tuple[Sensing, ...]
 
@@ -59,10 +42,10 @@ class Job:
     @property
     def digest(self) -> str:
         """Return the SHA-256 of everything that decides the job's files."""
-        described = dataclasses.asdict(self) | {"family": Path(self.family).stem}
-        described["settings"] = _differing(self.settings)
+        described = records.plain(self, complete=True) | {"family": Path(self.family).stem}
+        described["settings"] = given(self.settings)
         described["settings"].pop("camera_path", None)  # the content of the file decides, see below
-        described["streams"] = [_differing(stream) for stream in self.streams]
+        described["streams"] = [given(stream) for stream in self.streams]
         for stream in described["streams"]:
             for key in ("sensor", "colour"):
                 if isinstance(stream.get(key), str):
@@ -73,16 +56,6 @@ class Job:
         if own:  # the content of a file decides, not its name
             described["own"] = [_contents(path) for path in own]
         return hashlib.sha256(to_json(described)).hexdigest()
-
-
-def _differing(record: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass that differ from their defaults: a setting that is off changes no digest."""
-    values = dataclasses.asdict(record)
-    return {
-        field.name: values[field.name]
-        for field in dataclasses.fields(record)
-        if getattr(record, field.name) != field.default
-    }
 
 
 State = tuple[tuple[str, tuple[int, ...]], ...]  # of files: name and what changes with the content

@@ -2,7 +2,7 @@
 
     work/NAME[.part]   the clip while it is rendered          (resumable, never read)
     clips/NAME         the finished clip with its streams
-    jobs/NAME.json     the record: checksums of clip.json and of every stream's json; written last
+    jobs/NAME.json     the record (job_record.py); written last
     failed/NAME.json   the reason of a failure; removed when the job succeeds
     logs/NAME.log      date, machine, duration and memory; the only files that differ between two runs
 
@@ -19,10 +19,11 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from qsim import files, locks, scratch
+from qsim import descriptions, files, locks, scratch
 from qsim.dataset.job import Job
+from qsim.dataset.job_record import Failure, JobRecord, failure_path, record_path
 from qsim.dataset.provenance import assets, origin, photographs
 from qsim.process import peak_memory
 from qsim.streams.clip import Clip
@@ -62,7 +63,7 @@ def render_job(job: Job, path: Path) -> object:
         seed=render_seed(job),
         budget=choose_budget(job, scene),
         made_of=replace(origin(job, read), assets=tuple(sorted(assets(scene.to_dict()) + photographs(scene)))),
-        force=True,  # replaces an unfinished clip of an earlier version
+        force=True,  # replaces an unfinished clip of other settings
     )
 
 
@@ -78,7 +79,7 @@ def load_traced(job: Job) -> tuple[Scene, dict[str, str]]:
 
     settings = job.settings
     moved = settings.camera_path is not None
-    size = (settings.height, settings.width)
+    size = settings.size
     scene, read = scene_files.load(job.family, job.scene_seed, job.speed, along_path=moved, bands=settings.bands)
     scene = along_path(scene, settings.camera_path, settings.frame_rate, size, job.speed)
     return in_bands(scene.resized(*size), settings.bands), read
@@ -136,16 +137,6 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
     )
 
 
-def record_path(folder: Path, name: str) -> Path:
-    """Return the path of the record; the job is done when it exists."""
-    return folder / "jobs" / f"{name}.json"
-
-
-def failure_path(folder: Path, name: str) -> Path:
-    """Return the path of the file that holds the reason of a failure."""
-    return folder / "failed" / f"{name}.json"
-
-
 def removed(folder: Path) -> str:
     """Return which part of a data set's folder was removed, and what to do; empty if none was."""
     gone = [place for place in (folder, *(folder / name for name in FOLDERS)) if not place.is_dir()]
@@ -191,7 +182,7 @@ def _do(job: Job, folder: Path, make: RenderJob) -> Result:
     for sensing in job.streams:
         _, line = sense(clip, sensing)
         _log(folder, job.name, line)
-    files.write_json(record_path(folder, job.name), make_record(job, clip.path))
+    descriptions.write(record_path(folder, job.name), JobRecord.of(job))
     failure_path(folder, job.name).unlink(missing_ok=True)
     seconds = (rendered - started, time.monotonic() - rendered)
     spent = f"clip {seconds[0]:.2f} s, streams {seconds[1]:.2f} s, "
@@ -200,18 +191,10 @@ def _do(job: Job, folder: Path, make: RenderJob) -> Result:
     return Result(job.name, "done")
 
 
-def make_record(job: Job, clip: Path) -> dict[str, Any]:
-    """Return the record: checksums of clip.json and of each stream's json. `FileNotFoundError` if one is missing."""
-    streams = {
-        sensing.stream_name: files.sha256(clip / "streams" / f"{sensing.stream_name}.json") for sensing in job.streams
-    }
-    record = {"name": job.name, "digest": job.digest, "split": job.split, "streams": streams}
-    return record | {"clip": files.sha256(clip / "clip.json")}
-
-
 def mark_failed(folder: Path, job: Job, message: str) -> None:
     """Write the reason of a failure; `generate` lists it until the job is retried."""
-    files.write_json(failure_path(folder, job.name), {"name": job.name, "digest": job.digest, "error": message})
+    note = Failure(name=job.name, digest=job.digest, error=message or "it does not say why")
+    descriptions.write(failure_path(folder, job.name), note)
 
 
 def _clip(job: Job, folder: Path, make: RenderJob) -> Clip:

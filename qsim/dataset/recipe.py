@@ -1,4 +1,4 @@
-"""Reads a recipe, one TOML file, into the jobs of a data set; every error names file, line and key.
+"""Reads a recipe, one TOML file, into the jobs of a data set; errors name file and place, as in `scenes[0].seeds[1]`.
 
     [recipe]
     name = "starter"           # of the data set: letters, digits, '.', '_', '-'
@@ -46,22 +46,27 @@ A (family, seed) belongs to one split at every speed, and a family of the test s
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from qsim import checks, files
+from qsim import checks, files, records
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.clip_info import ClipInfo
-from qsim.dataset.job import FRAME_RATE, Job, Settings
-from qsim.dataset.recipe_sections.scenes_section import SETTINGS, jobs_of, settings_of
-from qsim.dataset.recipe_sections.streams_section import streams_of
-from qsim.dataset.recipe_sections.toml_section import Section, Text, file_name
+from qsim.dataset.job import Job
+from qsim.dataset.recipe_file import Head, RecipeFile, ScenesSection, StreamsSection
 from qsim.optics.radiometry import RGB
+from qsim.parsing import parse_toml
+from qsim.rendering.render_settings import RenderSettings
+from qsim.scene.animated.gltf_body import GLTF_SUFFIXES, animated_file, animations_in
+from qsim.scene.camera_path import PLAIN, read_camera_path
+from qsim.settings import settings_of
 from qsim.streams.sensing import Sensing, filters_of, prepare
-from qsim.structure import Table
 
 SPLITS = checks.SPLITS
+MAX_STEM = 180  # characters of a scene's name, which gets a seed, a speed and a temporary ending as a file's name
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ class Recipe:
 
     name: str
     jobs: tuple[Job, ...]
-    source: dict[str, Any]  # the TOML file's content, as written
+    source: RecipeFile | None = None  # as it was written
 
     @property
     def splits(self) -> dict[str, list[str]]:
@@ -84,7 +89,7 @@ class Recipe:
 
 
 def load(path: str | Path) -> Recipe:
-    """Read a recipe, a file or the name of a shipped one; errors as `text_of`, or `FILE:LINE: error, remedy`."""
+    """Read a recipe, a file or the name of a shipped one; errors as `text_of`, or `FILE: place: error, remedy`."""
     found, text = text_of(path)
     return parse(text, found)
 
@@ -114,28 +119,120 @@ def text_of(path: str | Path) -> tuple[Path, str]:
 
 def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
     """Return the recipe in the text of a TOML file; errors name `path`, and relative files are beside it."""
-    written = Text(path, text)
-    document = Section(written, None, 0, written.content())
-    document.values({"recipe, if any": _kept, "scenes, if any": _kept, "streams, if any": _kept})
-    if not isinstance(document.table.get("recipe"), dict):
-        raise ValueError(f"{path}: the section [recipe] is missing")
-    head = Section(written, "recipe", 0, document.table["recipe"])
-    given = head.values(HEAD)
-    name = given["name"]
-    seed = given.get("seed", 0)
-    defaults = {"frame_rate": FRAME_RATE} | settings_of(head, given)
-    streams: list[Sensing] = []
-    taken: set[str] = set()
-    for section in document.sections("streams"):
-        streams += streams_of(section, seed, taken)
-    jobs: list[tuple[Job, Section]] = []
-    for section in document.sections("scenes"):
-        jobs += [(job, section) for job in jobs_of(section, defaults, seed, tuple(streams))]
+    source = records.convert(parse_toml(path, text), RecipeFile, str(path))
+    seed = source.recipe.seed or 0
+    streams = _streams_of(source, seed, path)
+    jobs: list[tuple[Job, str]] = []
+    for n, section in enumerate(source.scenes):
+        where = f"scenes[{n}]"
+        with _place(path, where):
+            jobs += [(job, where) for job in _jobs_of(section, source.recipe, seed, tuple(streams), path.parent)]
     _check_jobs(jobs, path)
-    return Recipe(name, tuple(job for job, _ in jobs), document.table)
+    _check_streams(jobs, streams, path)
+    return Recipe(source.recipe.name, tuple(job for job, _ in jobs), source)
 
 
-def _check_jobs(jobs: list[tuple[Job, Section]], path: Path) -> None:
+@contextlib.contextmanager
+def _place(path: Path, place: str) -> Iterator[None]:
+    """Put file and place, as in `scenes[1]`, before the message of an error."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{path}: {place}: {error}") from None
+
+
+def _jobs_of(section: ScenesSection, head: Head, seed: int, streams: tuple[Sensing, ...], beside: Path) -> list[Job]:
+    """Return one job per seed and speed of a section [[scenes]]."""
+    settings = _settings_of(section, head, beside)
+    family = _family(section.family, beside)
+    speeds = _several(section.speed, "speed")
+    if family.endswith(".xml") and speeds != (1.0,) and settings.camera_path is None:
+        raise ValueError("an .xml scene has no motion, so speed changes nothing; leave it out")
+    stem = Path(family).stem
+    seeds = _seeds(section)
+    try:
+        files.check_name(f"{stem}_{seeds[0]:04d}")
+    except ValueError as error:
+        raise ValueError(f"family: clips are named after the scene: {error}") from None
+    if len(stem) > MAX_STEM:
+        long = f"whose name has {len(stem)} characters; at most {MAX_STEM}"
+        raise ValueError(f"family: clips are named after the scene, {long}")
+    return [
+        Job(
+            name=f"{stem}_{scene_seed:04d}" + ("" if speed == 1 else f"_x{speed:g}"),
+            family=family,
+            scene_seed=scene_seed,
+            speed=speed,
+            split=section.split,
+            settings=settings,
+            seed=seed,
+            streams=streams,
+        )
+        for scene_seed in seeds
+        for speed in speeds
+    ]
+
+
+def _settings_of(section: ScenesSection, head: Head, beside: Path) -> RenderSettings:
+    """Return the settings of a section, else those of [recipe]; a camera path beside the recipe is read as a check."""
+    names = [setting.name for setting in settings_of(RenderSettings)]
+    given = {name: getattr(part, name) for part in (head, section) for name in names if getattr(part, name) is not None}
+    if "camera_path" in given:
+        file = (beside / given["camera_path"]).resolve()
+        try:
+            read_camera_path(file, frame_rate=1.0, size=(PLAIN.height, PLAIN.width))
+        except (ValueError, OSError) as error:
+            raise ValueError(f"camera_path: {error}") from None
+        given["camera_path"] = str(file)
+    return RenderSettings(**given)
+
+
+def _several(value: Any, name: str) -> tuple[Any, ...]:
+    """Return one value or a list of different ones as a tuple."""
+    values = value if isinstance(value, tuple) else (value,)
+    seen = set()
+    for item in values:
+        if item in seen:
+            raise ValueError(f"{name}: {item!r} is listed twice")
+        seen.add(item)
+    return values
+
+
+def _seeds(section: ScenesSection) -> Sequence[int]:
+    """Return the seeds of a section, listed or counted."""
+    if section.seeds is not None:
+        if section.count is not None or section.first is not None:
+            raise ValueError("give either seeds or count, not both")
+        return _several(section.seeds, "seeds")
+    first = section.first or 0
+    count = 1 if section.count is None else section.count
+    if first + count > 2**31:
+        raise ValueError(f"seeds {first} to {first + count - 1}; the largest is 2^31 - 1")
+    return range(first, first + count)
+
+
+def _family(family: str, beside: Path) -> str:
+    """Return a family of the library, or the absolute path of an existing scene file or folder."""
+    file = (beside / family).resolve()
+    if "/" in family and file.is_dir():
+        return str(file)
+    if family.endswith((".py", ".xml", *GLTF_SUFFIXES)):
+        if not file.is_file():
+            raise ValueError(f"family: no such scene file {file}")
+        if family.endswith(GLTF_SUFFIXES):
+            names: list[str | None] = [*animations_in(file)]
+            for name in names or [None]:
+                animated_file(file, animation=name)
+        return str(file)
+    from qsim.scenes import FAMILIES
+
+    if family not in FAMILIES:
+        meant = f"{family!r}{checks.suggest(family, FAMILIES)}; there are: {', '.join(sorted(FAMILIES))}"
+        raise ValueError(f"unknown family {meant}")
+    return family
+
+
+def _check_jobs(jobs: list[tuple[Job, str]], path: Path) -> None:
     """`ValueError` without jobs, for a clip listed twice, or a split that shares a scene.
 
     A scene may be in one split only, and a family of the test split in no other split.
@@ -145,60 +242,90 @@ def _check_jobs(jobs: list[tuple[Job, Section]], path: Path) -> None:
     seen: set[str] = set()
     split_of: dict[str, str] = {}
     tested = {job.stem for job, _ in jobs if job.split == "test"}
-    for job, section in jobs:
+    for job, where in jobs:
         if job.name in seen:
-            raise ValueError(f"{section.where()}: the clip {job.name} is listed twice; give one of them other seeds")
+            raise ValueError(f"{path}: {where}: the clip {job.name} is listed twice; give one of them other seeds")
         seen.add(job.name)
         same = job.family.endswith(".xml")  # the seed of such a scene changes its samples only
         scene = job.stem if same else job.scene
         if split_of.setdefault(scene, job.split) != job.split:
             cure = "an .xml scene is the same scene at every seed: leave one of them out"
             raise ValueError(
-                f"{section.where()}: scene {scene} is in the splits '{split_of[scene]}' and '{job.split}'; "
+                f"{path}: {where}: scene {scene} is in the splits '{split_of[scene]}' and '{job.split}'; "
                 + (cure if same else "splits are by scene, at any speed: give one of them other seeds")
             )
         if job.split != "test" and job.stem in tested:
-            where = f"{section.where()}: family {job.stem} is in the splits '{job.split}' and 'test'"
-            raise ValueError(f"{where}; the test split holds families that training never sees: move its scenes")
-    _check_streams(jobs)
+            raise ValueError(
+                f"{path}: {where}: family {job.stem} is in the splits '{job.split}' and 'test'; the test split holds "
+                "families that training never sees: move its scenes"
+            )
 
 
-def _check_streams(jobs: list[tuple[Job, Section]]) -> None:
-    """`ValueError` with the line of [[scenes]] for clips whose streams could not be drawn after rendering."""
+def _streams_of(source: RecipeFile, seed: int, path: Path) -> dict[Sensing, str]:
+    """Return the streams of all sections [[streams]] with their places, one per bits and light level."""
+    streams: dict[Sensing, str] = {}
+    taken: set[str] = set()
+    for n, section in enumerate(source.streams):
+        where = f"streams[{n}]"
+        with _place(path, where):
+            for sensing in _sensings_of(section, seed, path.parent):
+                try:
+                    name = sensing.stream_name
+                except ValueError as error:
+                    raise ValueError(f"sensor: streams are named after the sensor: {error}") from None
+                if name in taken:
+                    raise ValueError(f"two [[streams]] are called '{name}'; give one of them a name")
+                taken.add(name)
+                streams[sensing] = where
+    return streams
+
+
+def _sensings_of(section: StreamsSection, seed: int, beside: Path) -> list[Sensing]:
+    """Return one stream per bits and light level of a section; `ValueError` if sensor or filters cannot be read."""
+    units = [unit for unit in ("ppp", "lux", "absolute") if getattr(section, unit) is not None]
+    if len(units) != 1:
+        wanted = "give one light level, ppp = ..., lux = ... or absolute = true"
+        raise ValueError(f"{wanted}; {' and '.join(units) or 'none'} given")
+    levels: list[dict[str, Any]] = [{}]
+    if units[0] != "absolute":
+        levels = [{units[0]: level} for level in _several(getattr(section, units[0]), units[0])]
+    bits = _several(section.bits, "bits")
+    count = len(bits) * len(levels)
+    if section.name is not None and count > 1:
+        cure = "give one bits and one light level, or leave the name out"
+        raise ValueError(f"name: one name for {count} streams; {cure}")
+    names = [setting.name for setting in settings_of(Sensing) if setting.recipe and not setting.varied]
+    given = {name: getattr(section, name) for name in names if getattr(section, name) is not None}
+    for name in ("sensor", "colour"):
+        if str(given.get(name)).endswith(".toml"):
+            given[name] = str((beside / given[name]).resolve())
+    return [Sensing(**{"seed": seed} | given, bits=depth, **light) for depth in bits for light in levels]
+
+
+def _check_streams(jobs: list[tuple[Job, str]], streams: dict[Sensing, str], path: Path) -> None:
+    """`ValueError` with the places of scene and stream for clips whose streams could not be drawn after rendering."""
     seen = set()
-    for job, section in jobs:
+    for job, scene in jobs:
         own = job.family.endswith(".py")  # no other scene may state bands
         case = (job.settings, own)
         if case in seen:
             continue
         seen.add(case)
-        for sensing in job.streams:
-            with section.naming():
+        for sensing, stream in streams.items():
+            with _place(path, f"{stream} of {scene}"):
                 colour = job.settings.bands is not None or (own and filters_of(sensing) is not None)
                 clip = _unrendered(sensing.stream_name, job.settings, colour)
                 prepare(clip, replace(sensing, ppp=1.0, lux=None))
 
 
-def _unrendered(name: str, settings: Settings, colour: bool) -> ClipFolder:
+def _unrendered(name: str, settings: RenderSettings, colour: bool) -> ClipFolder:
     """Return a clip of mean light 1 without frames, for the checks of sensing."""
     info = ClipInfo(
         name=name,
-        shape=(settings.frames, settings.height, settings.width),
+        shape=(settings.frames, *settings.size),
         frame_rate=settings.frame_rate,
-        exposure=(settings.shutter or 1.0) / settings.frame_rate,
+        exposure=settings.exposure,
         mean_radiance=1.0,
         bands=RGB if colour else None,
     )
     return ClipFolder(Path(name), info)
-
-
-def _kept(value: Any) -> Any:
-    """Return the value: sections are checked one by one."""
-    return value
-
-
-HEAD: Table = {
-    "name": file_name,
-    "seed, if any": checks.seed,
-    **{key if key in ("frames", "height", "width") else f"{key}, if any": check for key, check in SETTINGS.items()},
-}

@@ -19,13 +19,13 @@ from qsim.files import NAME, Progress
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.fidelity import choose_budget
+from qsim.rendering.render_settings import SIDE
 from qsim.scene import Scene
 from qsim.scene.camera_path import read_camera_path
 from qsim.scenes.colours import coloured
 from qsim.streams.clip import Clip
 
 FRAMES = 21
-SIDE = 128  # px, height and width of a family or a file unless others are given
 
 
 def render(

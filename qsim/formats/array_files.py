@@ -35,7 +35,6 @@ from qsim.formats.recording import (
     white_of,
 )
 from qsim.sensor import packing
-from qsim.structure import is_whole, list_of
 
 _LARGEST_CHUNK = 1 << 29  # bytes of a zarr chunk in memory; one of quanta-spad-sim has up to 200 MB
 _LARGEST_METADATA = 1 << 22  # bytes
@@ -94,8 +93,13 @@ def written_with(path: Path, description: str) -> dict[str, Any] | None:
         return None
     software = found.get("software")
     shape = found.get("shape")
-    ours = isinstance(software, dict) and "qsim" in software and list_of(is_whole, 3)(shape)
+    ours = isinstance(software, dict) and "qsim" in software and _is_shape(shape)
     return found if ours else None
+
+
+def _is_shape(found: Any) -> bool:
+    """Return whether a value of a file is the shape [T, H, W] of frames."""
+    return isinstance(found, list) and len(found) == 3 and all(type(n) is int and n >= 1 for n in found)
 
 
 @dataclass(frozen=True)

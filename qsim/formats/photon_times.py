@@ -17,7 +17,7 @@ import json
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy import ndarray as Array
@@ -27,14 +27,23 @@ from qsim.checks import check_shape
 from qsim.clip.source import Source
 from qsim.files import decoding_errors
 from qsim.formats.recording import Hints, Recording
+from qsim.kinds import Positive, Whole
+from qsim.records import convert
 from qsim.sensor.defects.event_simulation import DETECTED, RELEASED
 from qsim.streams.rows import Rows, from_dict
 from qsim.streams.simulation import stored
 from qsim.streams.stream import Stream
-from qsim.structure import is_positive, is_whole, list_of
 
 FORMAT = "qsim-photons-1"
 _ARRAYS = {"times": "f8", "kind": "u1", "first": "i8", "meta": "u1"}
+
+
+class About(TypedDict):
+    """What `meta` states of the exposures."""
+
+    shape: tuple[Whole, Whole, Whole]
+    exposure: Positive  # s
+    frame_rate: Positive  # Hz
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,16 +147,15 @@ def read(path: Path) -> PhotonTimes:
         meta = json.loads(found["meta"].tobytes())
         if not isinstance(meta, dict) or meta.get("format") != FORMAT:
             raise ValueError(f"{path}: does not hold photon times of the format {FORMAT}")
-        if not list_of(is_whole, 3)(meta["shape"]):
-            raise ValueError(f"{path}: a shape of {meta['shape']!r:.40}; it is three whole numbers")
-        shape = check_shape(path, tuple(meta["shape"]))
-        exposure = meta["exposure"]
-        rate = meta["frame_rate"]
-        if not (is_positive(exposure) and is_positive(rate) and exposure * rate < 1 + 1e-9):
+        about = convert(meta, About, str(path))
+        shape = check_shape(path, about["shape"])
+        exposure = about["exposure"]
+        rate = about["frame_rate"]
+        if not exposure * rate < 1 + 1e-9:
             raise ValueError(f"{path}: an exposure of {exposure!r:.40} s at {rate!r:.40} frames per second")
         rows = from_dict(meta["rows"], f"{path}: rows") if "rows" in meta else None
         events = (found["times"], found["kind"], found["first"])
-        photons = PhotonTimes(shape, float(exposure), float(rate), *events, rows=rows)
+        photons = PhotonTimes(shape, exposure, rate, *events, rows=rows)
         _check(path, photons)
     return photons
 

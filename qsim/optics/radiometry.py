@@ -18,9 +18,9 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
+from qsim.kinds import LARGEST, SMALLEST
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
-from qsim.structure import LARGEST, SMALLEST
 
 PLANCK = 6.62607015e-34  # J s, exact (SI)
 LIGHT_SPEED = 299792458.0  # m s^-1, exact (SI)

@@ -13,14 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from qsim import colour, files
 from qsim.clip.clamped_error import stated, white_in
 from qsim.clip.motion_statistics import MOVING
-from qsim.dataset.checking import Restored
 from qsim.dataset.dataset import Dataset
 from qsim.files import Progress
 from qsim.report import html as page
@@ -39,6 +37,7 @@ from qsim.report.panels import (
     truth_panels,
     truth_photons,
 )
+from qsim.restored_video import Restored, RestoredInfo, describes_restored
 from qsim.streams.clip import Clip
 from qsim.streams.stream import Stream
 
@@ -123,7 +122,9 @@ def _kind(path: Path) -> str | None:
         found = files.read_json(path)
     except ValueError:
         return None
-    for kind in ("evaluation", "static", "restored"):
+    if describes_restored(found):
+        return "restored"
+    for kind in ("evaluation", "static"):
         if str(found.get("format", "")).startswith(f"quiver-{kind}-"):
             return kind
     return next((kind for kind, keys in _KEYS if keys <= found.keys()), None)
@@ -155,7 +156,7 @@ def dataset_sections(path: Path, step: Callable[[], None] = lambda: None) -> lis
     total = 0
     for name in data.names():
         clip = Clip.open(data.path / "clips" / name)
-        split = data.meta["jobs"][name]["split"]
+        split = data.info.jobs[name].split
         splits.append(split)
         frames, height, width = clip.shape
         total += frames
@@ -208,12 +209,12 @@ def restored_section(path: Path) -> page.Section:
     Flow, depth, bodies and hidden points of the clip lie over its light.
     """
     video = Restored.open(path)
-    meta = video.meta
+    info = video.info
     restored = video.frames()
     frames = chosen_frames(len(restored), *restored.shape[-2:])
     shown = np.asarray(restored[: len(frames)])
-    clip, stream = _source(meta)
-    name = str(meta["method"])
+    clip, stream = _source(info)
+    name = info.method
     truth = None
     panels: list[page.Panel] = []
     if clip is not None and stream is not None:
@@ -221,10 +222,10 @@ def restored_section(path: Path) -> page.Section:
     white = colour.peak(shown if truth is None else truth)
     own = page.Panel(f"restored by {name}", fit(toned(shown, white)), score(shown, truth))
     wheel = None
-    lines = [f"{meta.get('description', name)}; {page.seconds_text(meta['seconds_per_frame'])} per frame."]
+    lines = [f"{info.description or name}; {page.seconds_text(info.seconds_per_frame)} per frame."]
     if clip is None or stream is None or truth is None:
         panels = [own]
-        if clip is None and Path(f"{meta.get('source') or 'none'}").with_suffix(".json").is_file():
+        if clip is None and Path(info.source or "none").with_suffix(".json").is_file():
             lines.append("Its stream was replaced since: the video is shown without codes and light.")
     else:
         light = page.Panel(light_name(clip), fit(toned(truth, white)))
@@ -251,17 +252,17 @@ def restored_section(path: Path) -> page.Section:
     return page.section(f"Restored: {path.stem}", player, page.bullets(lines), wheel, story=story, facts=facts)
 
 
-def _source(meta: dict[str, Any]) -> tuple[Clip | None, Stream | None]:
+def _source(info: RestoredInfo) -> tuple[Clip | None, Stream | None]:
     """Return the clip and stream of a restored video, or (None, None) if they are no longer there, or were replaced."""
-    path = Path(f"{meta.get('source') or 'none'}")
+    path = Path(info.source or "none")
     try:
         clip = Clip.open(path.parents[1])
         stream = Stream.open(path.with_suffix(".json"))
     except (IndexError, ValueError, OSError):
         return None, None
     now = stream.meta.get("sha256")
-    shape = meta.get("shape") or stream.shape
-    same = (meta.get("source_sha256") or now) == now and (shape[0], *shape[-2:]) == tuple(stream.shape)
+    shape = info.shape or stream.shape
+    same = (info.source_sha256 or now) == now and (shape[0], *shape[-2:]) == tuple(stream.shape)
     return (clip, stream) if same else (None, None)
 
 

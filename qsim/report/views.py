@@ -23,6 +23,7 @@ from qsim.checks import check_shape, check_video
 from qsim.colour import bright_end
 from qsim.files import load_array
 from qsim.formats.recording import checked_codes
+from qsim.restored_video import Restored, RestoredInfo, describes_restored
 from qsim.sensor import packing
 from qsim.sensor.demosaicing import demosaic, determines_bands
 from qsim.streams.clip import Clip
@@ -75,7 +76,8 @@ def open_source(path: Path, *, bits: int | None = None, width: int | None = None
         return _stream_source(Stream.open(sidecar))
     if path.suffix != ".npy":
         raise ValueError(f"{path}: expected a clip folder, a stream or a .npy array; `qsim convert` reads other files")
-    return _array_source(path, bits, width, described)
+    video = Restored.open(sidecar).info if describes_restored(described) else None
+    return _array_source(path, bits, width, video)
 
 
 def _refuse(path: Path, what: str, **options: int | str | None) -> None:
@@ -139,16 +141,16 @@ def _stream_source(stream: Stream) -> Source:
     return Source(stream.name, len(stream), float(stream.meta["frame_rate"]), views)
 
 
-def _array_source(path: Path, bits: int | None, width: int | None, described: dict[str, Any]) -> Source:
+def _array_source(path: Path, bits: int | None, width: int | None, video: RestoredInfo | None) -> Source:
     array = load_array(path)
     array = array[None] if array.ndim == 2 else array
-    length = (check_shape if described.get("colour") is None else check_video)(path, array.shape)[0]
-    rate = described.get("frame_rate")
+    in_colour = video is not None and bool(video.colour)
+    length = (check_video if in_colour else check_shape)(path, array.shape)[0]
+    rate = None if video is None else video.frame_rate
     if array.dtype.kind == "f":
         _refuse(path, "an array of values, not of codes", bits=bits, width=width)
-        what = described.get("method", "values")
-        unit = described.get("unit", "as stored")
-        title = f"restored by {what}" if "method" in described else what
+        title = "values" if video is None else f"restored by {video.method}"
+        unit = "as stored" if video is None else video.unit
         view = _light_view("values", title, unit, length, lambda t: np.asarray(array[t], np.float64))
         return Source(path.stem, length, rate, {"values": view})
     if array.dtype.kind == "b":

@@ -16,20 +16,22 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Required, TypedDict, get_type_hints
 
 import numpy as np
+from msgspec import Meta
 from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import MAX_PIXELS
 from qsim.file_order import natural
+from qsim.kinds import Number, Positive
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
 from qsim.optics.zoom import Zoom
+from qsim.records import convert
 from qsim.scene.motion import Keyframes
 from qsim.scene.rotation import logarithm, vector
-from qsim.structure import FLAG, NUMBER, POSITIVE, TEXT, Table, expected, is_number, list_of, structure
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: y up, z back <-> y down, z forward
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # world: z up -> y up
@@ -42,31 +44,63 @@ TERMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 ZERO = ("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew")  # terms of lenses that are not modelled
 OTHER_LENSES = ("is_fisheye", "latlong", "equirectangular", "orthographic")  # flags of other projections
 
-_SIZE = expected("a whole number of pixels", lambda v: is_number(v) and v == int(v) and 1 <= v <= MAX_PIXELS)
-_ANGLE = expected("an angle of view from 0 to pi [rad]", lambda v: is_number(v) and 1e-6 <= v <= 3.14)
-_LENS: Table = {
-    **{f"{key}, if any": _SIZE for key in ("w", "h")},
-    **{f"{key}, if any": POSITIVE for key in ("fl_x", "fl_y")},
-    **{f"{key}, if any": NUMBER for key in ("cx", "cy", *TERMS, *ZERO)},
-    **{f"{key}, if any": _ANGLE for key in ("camera_angle_x", "camera_angle_y")},
-    "camera_model, if any": TEXT,
-    **{f"{key}, if any": FLAG for key in OTHER_LENSES},
-}
-_KEYS = tuple(key.removesuffix(", if any") for key in _LENS)
+Pixels = Annotated[float, Meta(ge=1, le=MAX_PIXELS, multiple_of=1)]  # programs also write 800.0
+Angle = Annotated[float, Meta(ge=1e-6, le=3.14)]  # of view, rad
+
+
+class LensTable(TypedDict, total=False):
+    """What a file, or a frame of it, states of the lens."""
+
+    w: Pixels
+    h: Pixels
+    fl_x: Positive
+    fl_y: Positive
+    cx: Number
+    cy: Number
+    k1: Number
+    k2: Number
+    k3: Number
+    k4: Number
+    p1: Number
+    p2: Number
+    k5: Number
+    k6: Number
+    s1: Number
+    s2: Number
+    s3: Number
+    s4: Number
+    b1: Number
+    b2: Number
+    skew: Number
+    camera_angle_x: Angle
+    camera_angle_y: Angle
+    camera_model: str
+    is_fisheye: bool
+    latlong: bool
+    equirectangular: bool
+    orthographic: bool
+
+
+Row = tuple[Number, Number, Number, Number]
+
+
+class FrameTable(LensTable, total=False):
+    """A frame of a file."""
+
+    transform_matrix: Required[Annotated[tuple[Row, ...], Meta(min_length=3, max_length=4)]]
+    file_path: str
+
+
+class FileTable(LensTable, total=False):
+    """A transforms.json."""
+
+    frames: Required[list[dict[str, Any]]]
+    frame_rate: Positive
+
+
+_KEYS = tuple(get_type_hints(LensTable))
 _FOCAL = frozenset({"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"})
 _MAY_CHANGE = _FOCAL | {"cx", "cy", *TERMS}
-_FILE: Table = {
-    **_LENS,
-    "frames": expected("a list of frames", lambda v: isinstance(v, list) and all(isinstance(f, dict) for f in v)),
-    "frame_rate, if any": POSITIVE,
-}
-_FRAME: Table = {
-    **_LENS,
-    "transform_matrix": expected(
-        "a matrix of 4 x 4 numbers", lambda v: list_of(list_of(is_number, 4))(v) and len(v) in (3, 4)
-    ),
-    "file_path, if any": TEXT,
-}
 
 
 def read_camera_path(
@@ -99,7 +133,7 @@ def read_camera_path(
     for name, value in (("scale", scale), ("speed", speed)):
         if not 0 < value < math.inf:
             raise ValueError(f"{where}: {name} must be a number above 0, got {value!r}")
-    content = structure(files.read_json(Path(path)), _FILE, where, closed=False)
+    content: dict[str, Any] = {**convert(_without_nulls(files.read_json(Path(path))), FileTable, where)}
     frames = _in_order(content["frames"], where)
     rate = content.get("frame_rate") or frame_rate
     if rate is None:
@@ -198,12 +232,17 @@ def write_camera_path(
     files.write_json(Path(path), content)
 
 
+def _without_nulls(table: dict[str, Any]) -> dict[str, Any]:
+    """Return a table without keys of the value null, which count as missing."""
+    return {key: value for key, value in table.items() if value is not None}
+
+
 def _in_order(frames: list[dict[str, Any]], where: str) -> list[dict[str, Any]]:
     """Return the checked frames in the order of their pictures, as listed if not all have one."""
     if len(frames) < 2:
         raise ValueError(f"{where}: a path needs two or more frames, found {len(frames)}")
     found = [
-        structure(frame, _FRAME, f"{where}, frame {i}", closed=False) | {"where": f"{where}, frame {i}"}
+        {**convert(_without_nulls(frame), FrameTable, f"{where}, frame {i}"), "where": f"{where}, frame {i}"}
         for i, frame in enumerate(frames)
     ]
     if all(frame.get("file_path") is not None for frame in found):

@@ -30,6 +30,7 @@ from types import MappingProxyType
 
 from qsim import files
 from qsim.checks import file_path, suggest
+from qsim.records import convert
 from qsim.sensor import file_laws
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.file_laws import NOTHING, Conditions
@@ -37,7 +38,6 @@ from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
-from qsim.structure import make
 
 MODELS: Mapping[str, type[Sensor]] = MappingProxyType(
     {"QIS": QIS, "BinarySPAD": BinarySPAD, "CountingSPAD": CountingSPAD, "SpikeCamera": SpikeCamera}
@@ -353,7 +353,7 @@ def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:
     if not isinstance(name, str) or name not in MODELS:
         raise ValueError(f"{where}: model is one of {', '.join(MODELS)}, got {name!r}{suggest(str(name), MODELS)}")
     values = {key: value for key, value in settings.items() if key != "model"}
-    return make(MODELS[name], values, where)
+    return convert(values, MODELS[name], where)
 
 
 def _has_one_depth(model: object) -> bool:

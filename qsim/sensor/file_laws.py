@@ -23,21 +23,48 @@ wavelength alone. Between the points of a curve the efficiency is linear.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
+from qsim.kinds import NotNegative
+from qsim.records import convert
 from qsim.sensor.defects.fixed_pattern import DarkSpread
 
-KEYS = ("median", "dark_doubling", "dark_reference", "temperature", "qe_curve")
 DARK = {"QIS": "dark_current", "SpikeCamera": "dark_current"}  # of other models: dark_count_rate
 EFFICIENCY = {"QIS": "quantum_efficiency", "SpikeCamera": "quantum_efficiency"}  # of other models: pde
 # degrees C
 COLDEST = -273.15
 HOTTEST = 300.0
 WAVELENGTH = 550e-9  # m, where no clip states another: that of cameras
+
+Celsius = Annotated[float, Meta(ge=COLDEST, le=HOTTEST)]
+Point = tuple[Annotated[float, Meta(ge=1e-7, le=2e-5)], Annotated[float, Meta(ge=0.0, le=1.0)]]  # m, efficiency
+Curve = Annotated[tuple[Point, ...], Meta(min_length=2)]  # of rising wavelength
+
+
+@dataclass(frozen=True, kw_only=True)
+class Laws:
+    """The keys of [sensor] that are laws of the file."""
+
+    median: Annotated[
+        NotNegative | None, Meta(description="1/s, dark rate of the median pixel, in place of the mean")
+    ] = None
+    dark_doubling: Annotated[
+        Annotated[float, Meta(ge=0.1, le=1e12)] | None, Meta(description="K: the dark rate doubles per so many kelvin")
+    ] = None
+    dark_reference: Annotated[Celsius | None, Meta(description="degrees C at which the dark rate is stated")] = None
+    temperature: Annotated[Celsius | None, Meta(description="degrees C of the sensor; default: dark_reference")] = None
+    qe_curve: Annotated[
+        Curve | None, Meta(description="[[wavelength in m, efficiency], ...], in place of the efficiency")
+    ] = None
+
+
+KEYS = tuple(field.name for field in fields(Laws))
+_AS_IN = "as in [[450e-9, 0.3], [650e-9, 0.4]]"
 
 
 @dataclass(frozen=True)
@@ -55,30 +82,30 @@ NOTHING = Conditions()
 def resolved(table: Mapping[str, Any], where: str, conditions: Conditions = NOTHING) -> dict[str, Any]:
     """Return a table [sensor] without these laws, its dark rate and efficiency as they give them; `ValueError`."""
     plain = {key: value for key, value in table.items() if key not in KEYS}
+    laws = convert({key: table[key] for key in KEYS if key in table}, Laws, where)
     model = table.get("model")
     dark = DARK.get(str(model), "dark_count_rate")
     efficiency = EFFICIENCY.get(str(model), "pde")
-    if "median" in table:
+    if laws.median is not None:
         if dark in table:
             raise ValueError(f"{where}: {dark} (a mean) and median state the dark rate twice; leave one out")
-        factor = 1.0 if conditions.dark is None else conditions.dark.mean
-        plain[dark] = _number(table, "median", where, 0.0) * factor
-    if (factor := dark_factor(table, where, conditions.temperature)) != 1:
+        plain[dark] = laws.median * (1.0 if conditions.dark is None else conditions.dark.mean)
+    if (factor := dark_factor(laws, where, conditions.temperature)) != 1:
         if dark not in plain:
             raise ValueError(f"{where}: {dark} is missing; dark_doubling is the law of a stated dark rate")
-        plain[dark] = _number(plain, dark, where, 0.0) * factor
-    if "qe_curve" in table:
+        plain[dark] = convert(plain[dark], NotNegative, f"{where}: {dark}") * factor
+    if laws.qe_curve is not None:
         if efficiency in table:
             raise ValueError(f"{where}: {efficiency} and qe_curve state the efficiency twice; leave one out")
-        plain[efficiency] = efficiency_at(table["qe_curve"], conditions.wavelength or WAVELENGTH, where)
+        plain[efficiency] = efficiency_at(laws.qe_curve, conditions.wavelength or WAVELENGTH, where)
     return plain
 
 
-def dark_factor(table: Mapping[str, Any], where: str, temperature: float | None = None) -> float:
-    """Return the dark rate at a temperature [degrees C], or at that of the table, over the stated one; `ValueError`."""
-    if "dark_doubling" not in table:
+def dark_factor(laws: Laws, where: str, temperature: float | None = None) -> float:
+    """Return the dark rate at a temperature [degrees C], or at that of the file, over the stated one; `ValueError`."""
+    if laws.dark_doubling is None:
         for key in ("dark_reference", "temperature"):
-            if key in table:
+            if getattr(laws, key) is not None:
                 raise ValueError(f"{where}: {key} needs dark_doubling, the kelvin per doubling of the dark rate")
         if temperature is not None:
             raise ValueError(
@@ -86,11 +113,11 @@ def dark_factor(table: Mapping[str, Any], where: str, temperature: float | None 
                 "the temperature out"
             )
         return 1.0
-    if "dark_reference" not in table:
+    if laws.dark_reference is None:
         raise ValueError(f"{where}: dark_doubling needs dark_reference, the degrees C of the stated dark rate")
-    doubling = _number(table, "dark_doubling", where, 0.1)
-    reference = _number(table, "dark_reference", where, COLDEST, HOTTEST)
-    own = _number(table, "temperature", where, COLDEST, HOTTEST) if "temperature" in table else reference
+    doubling = laws.dark_doubling
+    reference = laws.dark_reference
+    own = reference if laws.temperature is None else laws.temperature
     here = own if temperature is None else temperature
     if not COLDEST <= here <= HOTTEST:
         raise ValueError(f"{where}: the temperature is in degrees C, {COLDEST:g} to {HOTTEST:g}, got {here!r}")
@@ -111,29 +138,14 @@ def temperature_of(table: Mapping[str, Any], temperature: float | None) -> float
 
 def efficiency_at(curve: Any, wavelength: float, where: str) -> float:
     """Return the efficiency of a curve [[m, efficiency], ...] at a wavelength [m]; `ValueError` outside of it."""
-    right = isinstance(curve, Sequence) and len(curve) >= 2 and all(_is_point(point) for point in curve)
-    lengths = [point[0] for point in curve] if right else []
-    if not right or any(after <= before for before, after in itertools.pairwise(lengths)):
-        raise ValueError(
-            f"{where}: qe_curve is two or more points [wavelength in m, efficiency from 0 to 1] of rising wavelength, "
-            f"as in [[450e-9, 0.3], [650e-9, 0.4]]; got {curve!r}"
-        )
+    points = convert(curve, Curve, f"{where}: qe_curve", cure=_AS_IN)
+    lengths = [length for length, _ in points]
+    if any(after <= before for before, after in itertools.pairwise(lengths)):
+        raise ValueError(f"{where}: qe_curve: expected points of rising wavelength, {_AS_IN}; got {curve!r:.200}")
     if not lengths[0] <= wavelength <= lengths[-1]:
         span = f"{1e9 * lengths[0]:g} to {1e9 * lengths[-1]:g} nm"
         raise ValueError(f"{where}: qe_curve covers {span}, and the light has {1e9 * wavelength:g} nm; extend it")
-    found = float(np.interp(wavelength, lengths, [point[1] for point in curve]))
+    found = float(np.interp(wavelength, lengths, [efficiency for _, efficiency in points]))
     if found <= 0:
         raise ValueError(f"{where}: qe_curve is 0 at {1e9 * wavelength:g} nm, so this sensor sees no such light")
     return found
-
-
-def _is_point(point: Any) -> bool:
-    numbers = isinstance(point, Sequence) and not isinstance(point, str) and len(point) == 2
-    return numbers and all(type(v) in (int, float) for v in point) and 1e-7 <= point[0] <= 2e-5 and 0 <= point[1] <= 1
-
-
-def _number(table: Mapping[str, Any], key: str, where: str, low: float, high: float = 1e12) -> float:
-    value = table[key]
-    if type(value) not in (int, float) or not low <= value <= high:
-        raise ValueError(f"{where}: {key} is a number from {low:g} to {high:g}, got {value!r}")
-    return float(value)

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from qsim import checks
+from qsim import checks, records
 from qsim.cli.console import bar, note, output
 from qsim.cli.options import checked, count, positive
 from quiver.cli.options import (
@@ -105,16 +105,16 @@ def _run_restore(args: argparse.Namespace) -> int:
                 note(lines.pop())
             progress(done, total)
 
-        meta = restore_to_file(codes, method, target, shown, force=args.force, note=note, threads=used)
+        info = restore_to_file(codes, method, target, shown, force=args.force, note=note, threads=used)
     for line in lines:
         note(line)
     length, height, width = codes.shape
     size = f"{height} x {width}" + ("" if codes.colour is None else " in R, G, B")
     output(
         args,
-        {"restored": str(target)} | meta,
+        {"restored": str(target)} | records.plain(info, complete=True),
         f"{target}: {length} frames of {size} by {method.name}, "
-        f"{meta['seconds_per_frame']:.3g} s per frame; photons, white of the sensor = {codes.white:.4g}",
+        f"{info.seconds_per_frame:.3g} s per frame; photons, white of the sensor = {codes.white:.4g}",
     )
     return 0
 

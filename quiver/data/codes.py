@@ -23,6 +23,7 @@ from qsim.arrays import plain
 from qsim.clip.lazy_array import LazyArray
 from qsim.files import read_json, sha256, to_json, wording
 from qsim.keys import Key, hash_name
+from qsim.restored_video import describes_restored
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.demosaicing import demosaic, determines_bands
 from qsim.sensor.sensor import Sensor
@@ -311,7 +312,7 @@ def _not_inverted(table: Mapping[str, Any]) -> str:
 
 def open_stream(path: Path) -> Stream:
     """Return the stored stream with this .npy or .json. `ValueError` for video written by `quiver restore`."""
-    if "seconds_per_frame" in read_json(path.with_suffix(".json")):
+    if describes_restored(read_json(path.with_suffix(".json"))):
         raise ValueError(f"{path}: is restored video; name the stream or the clip that it was made from")
     return Stream.open(path.with_suffix(".json"))
 

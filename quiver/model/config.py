@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from typing import Self
 
 from qsim.checks import shown
-from qsim.structure import make
+from qsim.records import convert
 
 FLOW_LAYERS = 8  # at most, of one level
 
@@ -67,4 +67,4 @@ class Config:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> Self:
         """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return make(cls, values, "QUIVER")
+        return convert(values, cls, "QUIVER")

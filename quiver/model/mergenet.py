@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from qsim.structure import make
+from qsim.records import convert
 from quiver.model.blocks import conv
 from quiver.model.config import whole_number
 
@@ -48,7 +48,7 @@ class MergeNetConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> MergeNetConfig:
         """Return the configuration of such values; ValueError for any others."""
-        return make(cls, values, "MergeNet")
+        return convert(values, cls, "MergeNet")
 
 
 class MergeNet(nn.Module):

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.structure import make
+from qsim.records import convert
 from quiver.model.blocks import RADIUS, WINDOW, check_input, conv, join
 from quiver.model.config import whole_number
 from quiver.model.rivals.edges import restored_range
@@ -35,7 +35,7 @@ class UNetConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> "UNetConfig":
         """Return the configuration of such values; ValueError for anything but a width."""
-        return make(cls, values, "UNet")
+        return convert(values, cls, "UNet")
 
 
 class SmallUNet(nn.Module):

@@ -13,20 +13,23 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.files import VERSION, Progress, read_json, sealed, sha256, sync_folder, write_json
+from qsim import descriptions
+from qsim.files import VERSION, Progress, read_json, sha256, sync_folder
+from qsim.kinds import Count, NotNegative
 from qsim.locks import Lock
+from qsim.restored_video import Restored, RestoredInfo, VideoInfo, describes_restored
 from qsim.scratch import sweep
 from quiver.data.codes import Codes
 from quiver.device import out_of_memory
 from quiver.restoration.interface import Restorer
 
-FORMAT = "quiver-restored-1"
 BLOCK_FRAMES = 256  # restored between two entries of the journal
 ZEROS = 1 << 24  # bytes written at a time where disk space is reserved by writing it
 WHAT_CHANGED = {  # key of the description -> its name in the message that a restoration starts again
@@ -42,6 +45,18 @@ WHAT_CHANGED = {  # key of the description -> its name in the message that a res
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class Unfinished(VideoInfo):
+    """The journal of a restoration: PATH.npy.part.json until the video is complete."""
+
+    FORMAT: ClassVar[str] = "quiver-unfinished"
+
+    done: Count = 0  # frames
+    seconds: NotNegative = 0.0
+    threads: Count | None = None
+    device: str = ""
+
+
 def restore_to_file(
     codes: Codes,
     method: Restorer,
@@ -51,8 +66,8 @@ def restore_to_file(
     force: bool = True,
     note: Callable[[str], None] | None = None,
     threads: int | None = None,
-) -> dict[str, Any]:
-    """Restore a stream into PATH.npy (float32 photons [T, H, W]) and PATH.json; return the content of the json.
+) -> RestoredInfo:
+    """Restore a stream into PATH.npy (float32 photons [T, H, W]) and PATH.json; return the description.
 
     Both appear when complete, the json last. Until then the video is PATH.npy.part, written in blocks of BLOCK_FRAMES.
     An interrupted restoration of the same codes by the same method resumes after its last block. If codes or method
@@ -66,20 +81,26 @@ def restore_to_file(
     part, journal = _parts(path)
     with _only_writer(path):
         sweep(path.parent)
-        meta = _described(codes, method)
+        wanted = _described(codes, method)
         if unnamed(path):
             os.replace(journal, path.with_suffix(".json"))
             sync_folder(path.parent)
-            if not _done(path, path.with_suffix(".json"), meta)[2]:
-                return read_json(path.with_suffix(".json"))
+            if not _done(path, path.with_suffix(".json"), wanted)[2]:
+                return Restored.open(path.with_suffix(".json")).info
         _check_target(path, journal, force)
         _check_unfinished(part, journal)
         try:
-            seconds = _fill_file(codes, method, part, journal, meta, progress, note, threads)
-            meta |= {"seconds_per_frame": seconds / codes.shape[0], "threads": threads, "device": method.device}
-            meta |= {"look_ahead": method.look_ahead, "source_sha256": codes.source_sha256}
-            meta = sealed(meta | {"sha256": sha256(part)})
-            write_json(journal, meta)  # takes its disk space before anything is replaced
+            seconds = _fill_file(codes, method, part, journal, wanted, progress, note, threads)
+            info = RestoredInfo(
+                **vars(wanted),
+                seconds_per_frame=seconds / codes.shape[0],
+                threads=threads,
+                device=method.device,
+                look_ahead=method.look_ahead,
+                source_sha256=codes.source_sha256,
+                sha256=sha256(part),
+            )
+            descriptions.write(journal, info)  # takes its disk space before anything is replaced
         except BaseException as error:
             resumable = not isinstance(error, Exception) or out_of_memory(error)
             if not (resumable and _has_frames(journal)):
@@ -92,31 +113,27 @@ def restore_to_file(
         os.replace(part, path)
         os.replace(journal, path.with_suffix(".json"))
         sync_folder(path.parent)
-    return meta
+    return info
 
 
-def _described(codes: Codes, method: Restorer) -> dict[str, Any]:
+def _described(codes: Codes, method: Restorer) -> VideoInfo:
     """Return what is known of a video before it is restored, and what must agree to resume it."""
-    meta: dict[str, Any] = {
-        "format": FORMAT,
-        "quiver": VERSION,
-        "method": method.name,
-        "description": method.description,
-        "identity": dict(method.identity) | {"cut": method.cut(*_at_a_time(codes))},
-        "unit": "photons",
-        "white": codes.white,
-        "shape": list(codes.video_shape),
-        "frame_rate": codes.frame_rate,
-        "exposure": codes.exposure,
-        "sensor": codes.sensor.to_dict(),
-        "source": codes.source,
-        "codes_sha256": codes.digest(),
-    }
-    if codes.colour is not None:
-        meta["colour"] = codes.colour.to_dict() | {"bands": "R, G, B", "by": "places of the mask, then demosaicing"}
-    if codes.not_inverted:
-        meta["not_inverted"] = codes.not_inverted
-    return meta
+    by_places = {"bands": "R, G, B", "by": "places of the mask, then demosaicing"}
+    return VideoInfo(
+        quiver=VERSION,
+        method=method.name,
+        description=method.description,
+        identity=dict(method.identity) | {"cut": method.cut(*_at_a_time(codes))},
+        white=codes.white,
+        shape=codes.video_shape,
+        frame_rate=codes.frame_rate,
+        exposure=codes.exposure,
+        sensor=codes.sensor.to_dict(),
+        source=codes.source,
+        codes_sha256=codes.digest(),
+        colour={} if codes.colour is None else codes.colour.to_dict() | by_places,
+        not_inverted=codes.not_inverted,
+    )
 
 
 @contextlib.contextmanager
@@ -147,14 +164,14 @@ def _has_frames(journal: Path) -> bool:
     """Return whether a journal records finished frames."""
     with contextlib.suppress(OSError, ValueError):
         found = read_json(journal)
-        return bool(found.get("done")) or "seconds_per_frame" in found
+        return bool(found.get("done")) or describes_restored(found)
     return False
 
 
 def _complete(journal: Path) -> bool:
     """Return whether a journal describes a complete video: its writer was killed during the renames."""
     with contextlib.suppress(FileNotFoundError, ValueError):
-        return "seconds_per_frame" in read_json(journal)
+        return describes_restored(read_json(journal))
     return False
 
 
@@ -166,7 +183,7 @@ def _check_target(path: Path, journal: Path, force: bool) -> None:
         if file.exists() and not force:
             raise FileExistsError(f"{file}: exists; name another with -o, or use --force to replace it")
     description = path.with_suffix(".json")
-    if description.exists() and read_json(description).get("format") != FORMAT:
+    if description.exists() and not describes_restored(read_json(description)):
         raise FileExistsError(
             f"{description}: does not describe restored video, and --force replaces nothing else; name another with -o"
         )
@@ -182,7 +199,8 @@ def _check_unfinished(part: Path, journal: Path) -> None:
     ours = not os.path.lexists(journal)
     if not ours and journal.is_file() and not journal.is_symlink():
         with contextlib.suppress(ValueError):
-            ours = read_json(journal).get("format") == FORMAT
+            found = read_json(journal)
+            ours = found.get("format") in (RestoredInfo.FORMAT, Unfinished.FORMAT)
     foreign = [] if ours else [journal]
     if os.path.lexists(part) and (part.is_symlink() or not (part.is_file() and journal.exists())):
         foreign.append(part)
@@ -198,18 +216,18 @@ def _fill_file(
     method: Restorer,
     part: Path,
     journal: Path,
-    meta: dict[str, Any],
+    wanted: VideoInfo,
     progress: Progress | None,
     note: Callable[[str], None] | None,
     threads: int | None,
 ) -> float:
     """Restore the missing frames of PART, record each block in JOURNAL, and return the seconds of all blocks."""
     length = codes.shape[0]
-    done, seconds, why = _done(part, journal, meta)
+    done, seconds, why = _done(part, journal, wanted)
     if why and note is not None:
         note(f"{part}: holds an interrupted restoration, but {why}; starting again")
     if not done:  # the journal first: it proves that the video is ours
-        write_json(journal, meta | {"done": 0, "seconds": 0.0})
+        descriptions.write(journal, Unfinished(**vars(wanted)))
         part.unlink(missing_ok=True)
         _reserve(part, codes.video_shape)
     out = np.lib.format.open_memmap(part, mode="r+")
@@ -221,8 +239,10 @@ def _fill_file(
         check_finite(block, method.name, first)
         out.flush()
         seconds += time.perf_counter() - started
-        ran = {"done": first + len(block), "seconds": seconds, "threads": threads, "device": method.device}
-        write_json(journal, meta | ran)
+        reached = Unfinished(
+            **vars(wanted), done=first + len(block), seconds=seconds, threads=threads, device=method.device
+        )
+        descriptions.write(journal, reached)
     with open(part, "rb") as file:
         os.fsync(file.fileno())
     return seconds
@@ -249,30 +269,30 @@ def _reserve(part: Path, shape: tuple[int, ...]) -> None:
                 file.write(bytes(min(ZEROS, stop - written)))
 
 
-def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, str]:
+def _done(part: Path, journal: Path, wanted: VideoInfo) -> tuple[int, float, str]:
     """Return the finished frames and seconds of an interrupted restoration, and why it cannot be resumed, if so."""
     if not (part.exists() and journal.exists()):
         return 0, 0.0, ""
     try:
-        found = read_json(journal)
-        for key in ("threads", "device", "look_ahead", "source_sha256"):  # on any device numbers agree to rounding
-            found.pop(key, None)
-        done = int(found.pop("done", 0))
-        seconds = float(found.pop("seconds", 0.0))
-        for key in ("sha256", "checksum"):
-            found.pop(key, None)
-        if "seconds_per_frame" in found:  # complete: killed before the rename
-            done = meta["shape"][0]
-            seconds = meta["shape"][0] * float(found.pop("seconds_per_frame"))
-    except (ValueError, TypeError) as error:
+        found: Unfinished | RestoredInfo
+        if _complete(journal):  # killed before the rename
+            found = descriptions.read(journal, RestoredInfo, "restore the video again")
+            done = found.shape[0] if found.shape is not None else 0
+            seconds = done * found.seconds_per_frame
+        else:
+            found = descriptions.read(journal, Unfinished, "restore the video again")
+            done = found.done
+            seconds = found.seconds
+    except ValueError as error:
         return 0, 0.0, f"its journal is damaged ({error})"
-    changed = [key for key in meta if found.get(key) != meta[key]]
-    if not changed and found.keys() == meta.keys():
+    # Threads and device may differ: on any device numbers agree to rounding.
+    changed = [field.name for field in fields(VideoInfo) if getattr(found, field.name) != getattr(wanted, field.name)]
+    if not changed:
         return done, seconds, ""
     told = dict.fromkeys(WHAT_CHANGED[key] for key in WHAT_CHANGED if key in changed)
-    before = found.get("identity")
-    now = meta["identity"]
-    if changed == ["identity"] and isinstance(before, dict) and before | {"cut": now["cut"]} == now:
+    before = found.identity
+    now = wanted.identity
+    if changed == ["identity"] and before | {"cut": now["cut"]} == now:
         cuts = [tiles or "none" for tiles in (before.get("cut"), now["cut"])]
         return 0, 0.0, f"the tiles of a frame, by --memory and the device, were {cuts[0]} and are {cuts[1]} now"
     return 0, 0.0, f"{' and '.join(told) or 'its description'} changed since"

@@ -5,17 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import descriptions
 from qsim.clip.clip_info import PHYSICAL, RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.dataset.generation import Options, generate
-from qsim.dataset.job import Job, Settings
+from qsim.dataset.job import Job
 from qsim.dataset.recipe import Recipe
 from qsim.optics.camera import Camera
 from qsim.optics.radiometry import RGB
+from qsim.rendering.render_settings import RenderSettings
+from qsim.restored_video import RestoredInfo
 from qsim.streams.clip import Clip
 
 ClipMaker = Callable[..., Clip]
@@ -66,6 +70,11 @@ def write_clip(
     return Clip.open(path)
 
 
+def describe_video(path: Path, **about: Any) -> None:
+    """Write the description NAME.json of restored video."""
+    descriptions.write(path, RestoredInfo(**{"method": "moment", "seconds_per_frame": 0.1} | about))
+
+
 def colour_clip(path: Path, frames: int = 3, height: int = 7, width: int = 9, **meta: object) -> Clip:
     """A clip of three bands whose patterns differ, of odd size unless others are given."""
     bands = [sliding_pattern(frames, height, width, seed) * light for seed, light in ((1, 0.6), (2, 1.0), (3, 1.7))]
@@ -74,7 +83,7 @@ def colour_clip(path: Path, frames: int = 3, height: int = 7, width: int = 9, **
 
 def write_dataset(path: Path, splits: dict[str, int], **options: object) -> Path:
     """A data set folder with so many clips per split, generated with our pattern in place of a renderer."""
-    settings = Settings(frames=14, height=36, width=44, frame_rate=2000.0)
+    settings = RenderSettings(frames=14, height=36, width=44, frame_rate=2000.0)
     jobs = tuple(
         Job(f"{split}_{i}", f"{split}_family", i, 1.0, split, settings, 0, ())
         for split, count in splits.items()
@@ -84,7 +93,7 @@ def write_dataset(path: Path, splits: dict[str, int], **options: object) -> Path
     def make(job: Job, target: Path) -> object:
         return write_clip(target, seed=job.scene_seed + 100 * len(job.split), job=job.digest, **options)
 
-    generate(Recipe("tiny", jobs, {}), path, Options(workers=0), make=make)
+    generate(Recipe("tiny", jobs), path, Options(workers=0), make=make)
     return path
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from clips import sliding_pattern, write_clip
 
-from qsim.dataset.redraw import redraw
+from qsim.dataset.checking import redraw
 from qsim.optics.radiometry import RGB
 from qsim.sensor import QIS, BinarySPAD, CountingSPAD, Sensor, SpikeCamera
 from qsim.sensor.defects.defect_table import from_dict

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import raw_planes
+from clips import describe_video
 from fakes import RECIPE
 from forks import forked
 from gltf_files import arm
@@ -29,10 +30,11 @@ from qsim.cli.program import main
 from qsim.clip import exr
 from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
-from qsim.dataset import checking, recipe
+from qsim.dataset import recipe
 from qsim.formats import array_files, detection, images, importing, video
 from qsim.formats.recording import Hints
 from qsim.process import peak_memory
+from qsim.restored_video import Restored
 from qsim.scene import animated_file
 from qsim.sensor import devices
 from qsim.sensor.defects import defect_table
@@ -180,12 +182,11 @@ def read_map(folder: Path) -> None:
 
 def make_video(folder: Path) -> None:
     np.save(folder / "v.npy", np.ones((T, H, W), np.float32))
-    about = {"method": "moment", "seconds_per_frame": 0.1, "shape": [T, H, W], "sha256": files.sha256(folder / "v.npy")}
-    files.write_description(folder / "v.json", about)
+    describe_video(folder / "v.json", shape=(T, H, W), sha256=files.sha256(folder / "v.npy"))
 
 
 def read_video(folder: Path) -> None:
-    restored = checking.Restored.open(folder / "v.json")
+    restored = Restored.open(folder / "v.json")
     restored.verify()
     assert restored.frames().shape == (T, H, W)
 

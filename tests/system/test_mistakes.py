@@ -199,7 +199,7 @@ MISTAKES = [
     # Recipes
     ("qsim generate none.toml", "none.toml: no such recipe"),
     ("qsim generate bad.toml -o x", "bad.toml:1: not valid TOML"),
-    ("qsim generate key.toml -o x", "key.toml:3: unknown key 'frmaes' in [recipe] (did you mean 'frames'?)"),
+    ("qsim generate key.toml -o x", "key.toml: unknown key 'recipe.frmaes' (did you mean 'frames'?)"),
     ("qsim generate type.toml -o x", "type.toml:3: frames: expected a whole number from 1 to 100000, got '3'"),
     ("qsim generate zero.toml -o x", "zero.toml:3: frames: expected a whole number from 1 to 100000, got 0"),
     ("qsim generate rate.toml -o x", "frame_rate: expected frames per second from 1 to 1e8, got 0.0005"),

@@ -69,7 +69,7 @@ def test_hostile_names_and_splits_leave_the_output_folder_alone(
             found["jobs"]["fan_0000"]["split"] = key
 
     def streams(found: dict) -> None:
-        found["streams"] = {str(name): next(iter(found["streams"].values()))}
+        found["streams"] = [str(name)]
 
     attacks = [
         (about, lambda found: found.update(name=name)),

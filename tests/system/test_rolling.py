@@ -41,13 +41,16 @@ def test_the_recipe_goes_from_rendering_to_the_report(tmp_path):
 
 def test_a_recipe_whose_rows_cannot_be_read_in_time_fails_before_rendering():
     for change, message in (
-        ("row_delay = 1.6e-6", r"rolling.toml:13: planes_down: 64 rows of 1.6e-06 s take 0.0001024 s, longer than"),
-        ('row_delay = "fast"', r"rolling.toml:22: .*expected a number"),
+        (
+            "row_delay = 1.6e-6",
+            r"rolling.toml: streams\[0\] of scenes\[0\]: planes_down: 64 rows of 1.6e-06 s take 0.0001024 s, ",
+        ),
+        ('row_delay = "fast"', r"rolling.toml: streams\[0\].row_delay: expected a number"),
     ):
         with pytest.raises(ValueError, match=message):
             recipe.parse(shipped().replace("row_delay = 1.5e-6", change, 1), RECIPES["rolling"].relative_to("/"))
     orders = shipped().replace("row_delay = 1.5e-6\nrow_order", "row_order")
     with pytest.raises(
-        ValueError, match="toml:25: row_order right: orders rows that have their own time; give row_delay"
+        ValueError, match=r"toml: streams\[\d\]: row_order right: orders rows that have their own time; give row_delay"
     ):
         recipe.parse(orders)

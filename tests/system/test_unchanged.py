@@ -124,7 +124,7 @@ def write_dataset(path: Path) -> Path:
         record = {"clip": "0" * 64, "digest": "", "name": f"moving_{seed}", "split": split, "streams": {}}
         (path / "jobs").mkdir(exist_ok=True)
         (path / "jobs" / f"moving_{seed}.json").write_text(json.dumps(record))
-    about = {"format_version": 1, "name": "moving", "recipe": {}, "jobs": jobs, "complete": True}
+    about = {"format_version": 1, "name": "moving", "jobs": jobs}
     write_description(path / "dataset.json", about)
     return path
 

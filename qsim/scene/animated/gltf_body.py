@@ -11,14 +11,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
+from msgspec import Meta
 
+from qsim.kinds import Count, Number
+from qsim.records import convert
 from qsim.scene.animated.gltf_buffers import Document, entries_of, open_document
 from qsim.scene.animated.gltf_materials import Paints
 from qsim.scene.animated.gltf_nodes import (
-    INDICES,
+    Indices,
+    Node,
     animation_names,
     chosen_animation,
     fixed,
@@ -33,7 +37,6 @@ from qsim.scene.mesh_pieces import Paint, Piece, by_paint
 from qsim.scene.motion import Motion, Still
 from qsim.scene.rotation import pose_matrix
 from qsim.scene.scene import Mesh
-from qsim.structure import COUNT, Table, expected, is_count, is_number, list_of, mapping_of, structure
 
 GLTF_SUFFIXES = (".glb", ".gltf")
 ROUNDING = 0.01  # by which the weights of a file may differ from a sum of 1: four bytes round by less
@@ -44,19 +47,33 @@ STRIP = 5
 FAN = 6
 MOST_VERTICES = 5_000_000  # of all pieces of a file
 
-ATTRIBUTES = expected("a table of accessors", mapping_of(r"\w+", is_count))
-PRIMITIVE: Table = {
-    "attributes": ATTRIBUTES,
-    "indices, if any": COUNT,
-    "mode, if any": COUNT,
-    "material, if any": COUNT,
-    "targets, if any": expected("a list of tables", list_of(mapping_of(r"\w+", is_count))),
-}
-MESH: Table = {
-    "primitives": expected("a list of one or more", lambda value: isinstance(value, list) and bool(value)),
-    "weights, if any": expected("a list of numbers", list_of(is_number)),
-}
-SKIN: Table = {"joints": INDICES, "inverseBindMatrices, if any": COUNT}
+Attributes = dict[Annotated[str, Meta(pattern=r"^\w+$")], Count]  # of what -> accessor
+
+
+class Primitive(TypedDict):
+    attributes: Attributes
+    indices: NotRequired[Count]
+    mode: NotRequired[Count]
+    material: NotRequired[Count]
+    targets: NotRequired[list[Attributes]]
+
+
+class MeshEntry(TypedDict):
+    primitives: Annotated[list[Any], Meta(min_length=1)]
+    weights: NotRequired[list[Number]]
+
+
+class Skin(TypedDict):
+    joints: Indices
+    inverseBindMatrices: NotRequired[Count]
+
+
+class SceneEntry(TypedDict):
+    nodes: NotRequired[Indices]
+
+
+class SceneChoice(TypedDict):
+    scene: NotRequired[Count]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +146,7 @@ def still_pieces(path: str | Path) -> list[Piece]:
 
 
 def _read(
-    document: Document, nodes: list[dict[str, Any]], tracks: dict[tuple[int, str], Track]
+    document: Document, nodes: list[Node], tracks: dict[tuple[int, str], Track]
 ) -> tuple[list[_Piece], list[Joint]]:
     """Return all primitives of the file's scene, and the joints that they follow."""
     order, parents = parents_first(document, nodes)
@@ -148,31 +165,28 @@ def _read(
     return by_paint(pieces), joints
 
 
-def _shown(
-    document: Document, nodes: list[dict[str, Any]], order: list[int], parents: Mapping[int, int]
-) -> Iterator[int]:
+def _shown(document: Document, nodes: list[Node], order: list[int], parents: Mapping[int, int]) -> Iterator[int]:
     """Yield the nodes of the file's scene; without scenes, all nodes."""
     scenes = entries_of(document.path, document.content, "scenes")
     if not scenes:
         yield from order
         return
-    about = structure(document.content, {"scene, if any": COUNT}, str(document.path), closed=False)
-    table: Table = {"nodes, if any": INDICES}
-    roots = set(document.entry("scenes", about.get("scene", 0), table, "scene").get("nodes", []))
+    about = convert(document.content, SceneChoice, str(document.path))
+    roots = set(document.entry("scenes", about.get("scene", 0), SceneEntry, "scene").get("nodes", []))
     for i in order:
         if i in roots or parents.get(i) in roots:
             roots.add(i)
             yield i
 
 
-def _target_count(document: Document, node: Mapping[str, Any]) -> int:
+def _target_count(document: Document, node: Node) -> int:
     """Return how many morph targets the mesh of a node has."""
     if "mesh" not in node:
         return 0
-    mesh = document.entry("meshes", node["mesh"], MESH, "a node")
+    mesh = document.entry("meshes", node["mesh"], MeshEntry, "a node")
     where = f"{document.path}: meshes[{node['mesh']}]"
     counts = {
-        len(structure(each, PRIMITIVE, f"{where}.primitives[{i}]", closed=False).get("targets", []))
+        len(convert(each, Primitive, f"{where}.primitives[{i}]").get("targets", []))
         for i, each in enumerate(mesh["primitives"])
     }
     if len(counts) > 1:
@@ -183,7 +197,7 @@ def _target_count(document: Document, node: Mapping[str, Any]) -> int:
 def _pieces(
     document: Document,
     number: int,
-    nodes: list[dict[str, Any]],
+    nodes: list[Node],
     tracks: Mapping[tuple[int, str], Track],
     joints: list[Joint],
     joint_of: Mapping[int, int],
@@ -191,11 +205,11 @@ def _pieces(
 ) -> Iterator[_Piece]:
     """Yield the primitives of a node; joints that a skin adds are appended to `joints`."""
     node = nodes[number]
-    mesh = document.entry("meshes", node["mesh"], MESH, f"nodes[{number}]")
+    mesh = document.entry("meshes", node["mesh"], MeshEntry, f"nodes[{number}]")
     bones = _bones(document, node["skin"], f"nodes[{number}]", joints, joint_of) if "skin" in node else None
     for i, each in enumerate(mesh["primitives"]):
         where = f"meshes[{node['mesh']}].primitives[{i}]"
-        primitive = structure(each, PRIMITIVE, f"{document.path}: {where}", closed=False)
+        primitive = convert(each, Primitive, f"{document.path}: {where}")
         attributes = primitive["attributes"]
         mode = primitive.get("mode", TRIANGLES)
         if POINTS <= mode < TRIANGLES and not tracks:
@@ -231,10 +245,11 @@ def _pieces(
 
 def _bones(document: Document, skin: int, by: str, joints: list[Joint], joint_of: Mapping[int, int]) -> np.ndarray:
     """Return the joints of a skin, each behind its node and with its inverse bind matrix; they are appended."""
-    about = document.entry("skins", skin, SKIN, by)
+    about = document.entry("skins", skin, Skin, by)
     missing = [node for node in about["joints"] if node not in joint_of]
     if missing or not about["joints"]:
-        raise ValueError(f"{document.path}: skins[{skin}]: its joints need nodes, found {(missing or ['none'])[0]}")
+        found = missing[0] if missing else "none"
+        raise ValueError(f"{document.path}: skins[{skin}]: its joints need nodes, found {found}")
     binds = np.tile(np.eye(4).ravel(), (len(about["joints"]), 1))
     if "inverseBindMatrices" in about:
         binds = document.array(about["inverseBindMatrices"], f"skins[{skin}]", "MAT4", len(binds))

@@ -14,15 +14,16 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NotRequired, TypedDict, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
 
 from qsim.checks import require_finite
+from qsim.kinds import Count, Whole
 from qsim.parsing import parse_json
+from qsim.records import convert
 from qsim.scene.files_beside import file_beside, regular_bytes
-from qsim.structure import COUNT, FLAG, TEXT, WHOLE, Table, expected, structure
 
 JSON_CHUNK = 0x4E4F534A
 BINARY_CHUNK = 0x004E4942
@@ -31,23 +32,56 @@ NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # What a file may require: these change materials or the type of numbers, which are read in any type.
 KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_punctual", "KHR_mesh_quantization")
 
-COMPONENT = expected(f"one of {', '.join(map(str, TYPES))}", lambda value: type(value) is int and value in TYPES)
-SHAPE = expected(f"one of {', '.join(NUMBERS)}", lambda value: isinstance(value, str) and value in NUMBERS)
-ACCESSOR: Table = {
-    "componentType": COMPONENT,
-    "count": WHOLE,
-    "type": SHAPE,
-    "bufferView, if any": COUNT,
-    "byteOffset, if any": COUNT,
-    "normalized, if any": FLAG,
-    "sparse, if any": {
-        "count": WHOLE,
-        "indices": {"bufferView": COUNT, "componentType": COMPONENT, "byteOffset, if any": COUNT},
-        "values": {"bufferView": COUNT, "byteOffset, if any": COUNT},
-    },
-}
-VIEW: Table = {"buffer": COUNT, "byteLength": WHOLE, "byteOffset, if any": COUNT, "byteStride, if any": WHOLE}
-BUFFER: Table = {"byteLength": WHOLE, "uri, if any": TEXT}
+Component = Literal[5120, 5121, 5122, 5123, 5125, 5126]  # the keys of TYPES
+Shape = Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT4"]  # the keys of NUMBERS
+Entry = TypeVar("Entry")
+
+
+class SparseIndices(TypedDict):
+    bufferView: Count
+    componentType: Component
+    byteOffset: NotRequired[Count]
+
+
+class SparseValues(TypedDict):
+    bufferView: Count
+    byteOffset: NotRequired[Count]
+
+
+class Sparse(TypedDict):
+    count: Whole
+    indices: SparseIndices
+    values: SparseValues
+
+
+class Accessor(TypedDict):
+    componentType: Component
+    count: Whole
+    type: Shape
+    bufferView: NotRequired[Count]
+    byteOffset: NotRequired[Count]
+    normalized: NotRequired[bool]
+    sparse: NotRequired[Sparse]
+
+
+class View(TypedDict):
+    buffer: Count
+    byteLength: Whole
+    byteOffset: NotRequired[Count]
+    byteStride: NotRequired[Whole]
+
+
+class Buffer(TypedDict):
+    byteLength: Whole
+    uri: NotRequired[str]
+
+
+class Asset(TypedDict):
+    version: str
+
+
+class Root(TypedDict):
+    asset: Asset
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +92,12 @@ class Document:
     content: dict[str, Any]
     buffers: tuple[bytes, ...]
 
-    def entry(self, kind: str, index: int, table: Table, by: str) -> dict[str, Any]:
+    def entry(self, kind: str, index: int, table: type[Entry], by: str) -> Entry:
         """Return entry `index` of a list, checked; `by` names who asks for it."""
         entries = entries_of(self.path, self.content, kind)
         if index >= len(entries):
             raise ValueError(f"{self.path}: {by} names {kind}[{index}]; there are {len(entries)}")
-        return structure(entries[index], table, f"{self.path}: {kind}[{index}]", closed=False)
+        return convert(entries[index], table, f"{self.path}: {kind}[{index}]")
 
     def array(self, index: int, by: str, shape: str, count: int | None = None) -> np.ndarray:
         """Return an accessor of this shape, float64 or int64 [count, numbers]; normalized numbers become -1 .. 1.
@@ -71,7 +105,7 @@ class Document:
         `count` is the expected number of elements; an accessor without data is zero and needs it.
         """
         where = f"accessors[{index}]"
-        about = self.entry("accessors", index, ACCESSOR, by)
+        about = self.entry("accessors", index, Accessor, by)
         if about["type"] != shape or count not in (None, about["count"]):
             raise ValueError(
                 f"{self.path}: {by} needs {'' if count is None else f'{count} of '}{shape}, "
@@ -98,7 +132,7 @@ class Document:
 
     def view(self, number: int, by: str) -> bytes:
         """Return the bytes of a bufferView."""
-        about = self.entry("bufferViews", number, VIEW, by)
+        about = self.entry("bufferViews", number, View, by)
         if about["buffer"] >= len(self.buffers):
             raise ValueError(f"{self.path}: bufferViews[{number}] names buffers[{about['buffer']}], which is missing")
         data = self.buffers[about["buffer"]]
@@ -107,7 +141,7 @@ class Document:
             raise ValueError(f"{self.path}: bufferViews[{number}] reaches beyond the {len(data)} bytes of its buffer")
         return data[start : start + about["byteLength"]]
 
-    def _patched(self, values: np.ndarray, sparse: Mapping[str, Any], where: str) -> np.ndarray:
+    def _patched(self, values: np.ndarray, sparse: Sparse, where: str) -> np.ndarray:
         """Return the values with some replaced, of a sparse accessor."""
         count = sparse["count"]
         indices = sparse["indices"]
@@ -130,7 +164,7 @@ class Document:
         return values
 
     def _elements(self, view: int, offset: int, count: int, numbers: int, kind: np.dtype, where: str) -> np.ndarray:
-        about = self.entry("bufferViews", view, VIEW, where)
+        about = self.entry("bufferViews", view, View, where)
         if about["buffer"] >= len(self.buffers):
             raise ValueError(f"{self.path}: bufferViews[{view}] names buffers[{about['buffer']}], which does not exist")
         data = self.buffers[about["buffer"]]
@@ -149,7 +183,7 @@ class Document:
 def open_document(path: Path) -> Document:
     """Return a .glb or .gltf file of version 2; `FileNotFoundError`, or `ValueError` with the name of the file."""
     content, chunk = _read(path)
-    version = structure(content, {"asset": {"version": TEXT}}, str(path), closed=False)["asset"]["version"]
+    version = convert(content, Root, str(path))["asset"]["version"]
     if not version.startswith("2."):
         raise ValueError(f"{path}: glTF of version {version[:20]}; version 2.0 is read")
     refuse_required(path, content)
@@ -230,7 +264,7 @@ def _chunks(path: Path, raw: bytes) -> tuple[bytes, bytes | None]:
 
 def _buffer(path: Path, index: int, entry: Any, chunk: bytes | None) -> bytes:
     where = f"{path}: buffers[{index}]"
-    about = structure(entry, BUFFER, where, closed=False)
+    about = convert(entry, Buffer, where)
     uri = about.get("uri")
     if uri is None:
         if index or chunk is None:

@@ -9,38 +9,77 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 from urllib.parse import unquote
 
 import numpy as np
+from msgspec import Meta
 
+from qsim.kinds import Count, Number
+from qsim.records import convert
 from qsim.scene.animated.gltf_buffers import Document, data_uri
 from qsim.scene.files_beside import picture_in, picture_of
 from qsim.scene.materials import Picture
 from qsim.scene.mesh_pieces import Paint
-from qsim.structure import COUNT, NUMBER, OBJECT, TEXT, Table, expected, is_number, list_of, structure
 
 WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = (9728, 9984, 9986)  # filters that take one texel: NEAREST, and with mipmaps
 WEBP = "EXT_texture_webp"
 BASIS = "KHR_texture_basisu"
 
-PAIR = expected("two numbers", list_of(is_number, 2))
-FACTOR = expected("four numbers from 0 to 1", lambda v: list_of(is_number, 4)(v) and all(0 <= n <= 1 for n in v))
-WRAP = expected(f"one of {', '.join(map(str, WRAPS))}", lambda value: type(value) is int and value in WRAPS)
-TEXTURE_INFO: Table = {"index": COUNT, "texCoord, if any": COUNT, "extensions, if any": OBJECT}
-TRANSFORM: Table = {
-    "offset, if any": PAIR,
-    "rotation, if any": NUMBER,
-    "scale, if any": PAIR,
-    "texCoord, if any": COUNT,
-}
-ROUGHNESS: Table = {"baseColorFactor, if any": FACTOR, "baseColorTexture, if any": TEXTURE_INFO}
-GLOSSINESS: Table = {"diffuseFactor, if any": FACTOR, "diffuseTexture, if any": TEXTURE_INFO}
-MATERIAL: Table = {"name, if any": TEXT, "pbrMetallicRoughness, if any": ROUGHNESS, "extensions, if any": OBJECT}
-TEXTURE: Table = {"source, if any": COUNT, "sampler, if any": COUNT, "extensions, if any": OBJECT}
-SAMPLER: Table = {"wrapS, if any": WRAP, "wrapT, if any": WRAP, "magFilter, if any": COUNT}
-IMAGE: Table = {"uri, if any": TEXT, "bufferView, if any": COUNT}
+Part = Annotated[float, Meta(ge=0.0, le=1.0)]
+Factor = tuple[Part, Part, Part, Part]
+Wrap = Literal[10497, 33071, 33648]  # the keys of WRAPS
+
+
+class TextureInfo(TypedDict):
+    index: Count
+    texCoord: NotRequired[Count]
+    extensions: NotRequired[dict[str, Any]]
+
+
+class Transform(TypedDict):
+    offset: NotRequired[tuple[Number, Number]]
+    rotation: NotRequired[Number]
+    scale: NotRequired[tuple[Number, Number]]
+    texCoord: NotRequired[Count]
+
+
+class Roughness(TypedDict):
+    baseColorFactor: NotRequired[Factor]
+    baseColorTexture: NotRequired[TextureInfo]
+
+
+class Glossiness(TypedDict):
+    diffuseFactor: NotRequired[Factor]
+    diffuseTexture: NotRequired[TextureInfo]
+
+
+class Material(TypedDict):
+    name: NotRequired[str]
+    pbrMetallicRoughness: NotRequired[Roughness]
+    extensions: NotRequired[dict[str, Any]]
+
+
+class Texture(TypedDict):
+    source: NotRequired[Count]
+    sampler: NotRequired[Count]
+    extensions: NotRequired[dict[str, Any]]
+
+
+class Sampler(TypedDict):
+    wrapS: NotRequired[Wrap]
+    wrapT: NotRequired[Wrap]
+    magFilter: NotRequired[Count]
+
+
+class Image(TypedDict):
+    uri: NotRequired[str]
+    bufferView: NotRequired[Count]
+
+
+class WebpTexture(TypedDict):
+    source: Count
 
 
 class Paints:
@@ -48,7 +87,7 @@ class Paints:
 
     def __init__(self, document: Document) -> None:
         self._document = document
-        self._found: dict[int, tuple[Paint, dict[str, Any] | None]] = {}
+        self._found: dict[int, tuple[Paint, TextureInfo | None]] = {}
         self._pictures: dict[int, tuple[Picture, str]] = {}  # several textures may share one
 
     def paint(self, number: int | None, by: str) -> Paint | None:
@@ -79,49 +118,49 @@ class Paints:
             found = scaled @ np.array([[cos, -sin], [sin, cos]]) + transform.get("offset", (0.0, 0.0))
         return found * (1, -1) + (0, 1)
 
-    def _transform(self, info: dict[str, Any] | None, by: str) -> dict[str, Any]:
-        extensions = (info or {}).get("extensions") or {}
+    def _transform(self, info: TextureInfo | None, by: str) -> Transform:
+        extensions = {} if info is None else info.get("extensions", {})
         if "KHR_texture_transform" not in extensions:
             return {}
         where = f"{self._document.path}: {by}: KHR_texture_transform"
-        return structure(extensions["KHR_texture_transform"], TRANSFORM, where, closed=False)
+        return convert(extensions["KHR_texture_transform"], Transform, where)
 
-    def _material(self, number: int, by: str) -> tuple[Paint, dict[str, Any] | None]:
+    def _material(self, number: int, by: str) -> tuple[Paint, TextureInfo | None]:
         if number not in self._found:
             self._found[number] = self._read(number, by)
         return self._found[number]
 
-    def _read(self, number: int, by: str) -> tuple[Paint, dict[str, Any] | None]:
+    def _read(self, number: int, by: str) -> tuple[Paint, TextureInfo | None]:
         """Return the paint of a material, and where its picture is placed."""
         document = self._document
-        about = document.entry("materials", number, MATERIAL, by)
+        about = document.entry("materials", number, Material, by)
         where = f"{document.path}: materials[{number}]"
-        base = about.get("pbrMetallicRoughness") or {}
+        base = about.get("pbrMetallicRoughness", Roughness())
         factor = base.get("baseColorFactor")
         info = base.get("baseColorTexture")
         older = (about.get("extensions") or {}).get("KHR_materials_pbrSpecularGlossiness")
         if older is not None and "pbrMetallicRoughness" not in about:
-            base = structure(older, GLOSSINESS, where, closed=False)
-            factor = base.get("diffuseFactor")
-            info = base.get("diffuseTexture")
+            glossy = convert(older, Glossiness, where)
+            factor = glossy.get("diffuseFactor")
+            info = glossy.get("diffuseTexture")
         red, green, blue = (factor or (1.0, 1.0, 1.0))[:3]
         if info is None:
             return Paint(where, (red, green, blue)), None
-        texture = document.entry("textures", info["index"], TEXTURE, f"materials[{number}]")
-        sampler: dict[str, Any] = {}
-        if texture.get("sampler") is not None:
-            sampler = document.entry("samplers", texture["sampler"], SAMPLER, f"textures[{info['index']}]")
+        texture = document.entry("textures", info["index"], Texture, f"materials[{number}]")
+        sampler = Sampler()
+        if "sampler" in texture:
+            sampler = document.entry("samplers", texture["sampler"], Sampler, f"textures[{info['index']}]")
         wrap = (WRAPS[sampler.get("wrapS", 10497)], WRAPS[sampler.get("wrapT", 10497)])
         read = functools.partial(self._image, texture, f"textures[{info['index']}]")
         return Paint(where, (red, green, blue), read, wrap, sampler.get("magFilter") in NEAREST), info
 
-    def _image(self, texture: Mapping[str, Any], by: str) -> tuple[Picture, str]:
+    def _image(self, texture: Texture, by: str) -> tuple[Picture, str]:
         """Return the picture of a texture and its SHA-256, from the file or from an image beside it."""
         document = self._document
         others = texture.get("extensions") or {}
         source = texture.get("source")
         if source is None and WEBP in others:
-            source = structure(others[WEBP], {"source": COUNT}, f"{document.path}: {by}", closed=False)["source"]
+            source = convert(others[WEBP], WebpTexture, f"{document.path}: {by}")["source"]
         if source is None:
             why = f"only one of {BASIS}, which is not read" if BASIS in others else "none"
             raise ValueError(f"{document.path}: {by} needs a picture and has {why}; export PNG or JPEG")
@@ -131,7 +170,7 @@ class Paints:
 
     def _picture(self, source: int, by: str) -> tuple[Picture, str]:
         document = self._document
-        about = document.entry("images", source, IMAGE, by)
+        about = document.entry("images", source, Image, by)
         where = f"{document.path}: images[{source}]"
         if about.get("bufferView") is not None:
             return picture_in(document.view(about["bufferView"], f"images[{source}]"), where)

@@ -3,36 +3,57 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import numpy as np
+from msgspec import Meta
 
 from qsim.checks import suggest
+from qsim.kinds import Count, Number
+from qsim.records import convert
 from qsim.scene.animated.gltf_buffers import Document, entries_of
 from qsim.scene.animated.skinning import Joint, Placed
 from qsim.scene.animated.tracks import Fixed, Keyed, Track
-from qsim.structure import COUNT, TEXT, Table, expected, is_number, list_of, structure
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}  # numbers per key; "weights" has one per morph target
 REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 INTERPOLATION = {"STEP": "step", "LINEAR": "linear", "CUBICSPLINE": "cubic"}
 UNIT = 0.02  # by which the length of a quaternion may differ from 1: bytes round by less
 
-INDICES = expected("a list of whole numbers from 0", list_of(lambda value: type(value) is int and value >= 0))
-NODE: Table = {
-    "children, if any": INDICES,
-    "mesh, if any": COUNT,
-    "skin, if any": COUNT,
-    "matrix, if any": expected("16 numbers", list_of(is_number, 16)),
-    "weights, if any": expected("a list of numbers", list_of(is_number)),
-    **{f"{path}, if any": expected(f"{n} numbers", list_of(is_number, n)) for path, n in PATHS.items()},
-}
-CHANNEL: Table = {"sampler": COUNT, "target": {"node, if any": COUNT, "path": TEXT}}
-SAMPLER: Table = {
-    "input": COUNT,
-    "output": COUNT,
-    "interpolation, if any": expected("STEP, LINEAR or CUBICSPLINE", lambda value: value in tuple(INTERPOLATION)),
-}
+Indices = list[Count]
+
+
+class Node(TypedDict):
+    children: NotRequired[Indices]
+    mesh: NotRequired[Count]
+    skin: NotRequired[Count]
+    matrix: NotRequired[Annotated[list[Number], Meta(min_length=16, max_length=16)]]
+    weights: NotRequired[list[Number]]
+    translation: NotRequired[tuple[Number, Number, Number]]
+    rotation: NotRequired[tuple[Number, Number, Number, Number]]
+    scale: NotRequired[tuple[Number, Number, Number]]
+
+
+class Target(TypedDict):
+    node: NotRequired[Count]
+    path: str
+
+
+class Channel(TypedDict):
+    sampler: Count
+    target: Target
+
+
+class TrackSampler(TypedDict):
+    input: Count
+    output: Count
+    interpolation: NotRequired[Literal["STEP", "LINEAR", "CUBICSPLINE"]]
+
+
+class Animation(TypedDict):
+    name: NotRequired[str]
+
+
 Tracks = dict[tuple[int, str], Track]  # of (node, path)
 
 
@@ -40,7 +61,7 @@ def animation_names(document: Document) -> list[str]:
     """Return the names of a file's animations; one without a name has its number, and so have repeated names."""
     found: list[str] = []
     for i, entry in enumerate(entries_of(document.path, document.content, "animations")):
-        about = structure(entry, {"name, if any": TEXT}, f"{document.path}: animations[{i}]", closed=False)
+        about = convert(entry, Animation, f"{document.path}: animations[{i}]")
         name = about.get("name", str(i))
         found.append(f"{name} #{i}" if name in found else name)
     return found
@@ -61,13 +82,13 @@ def chosen_animation(document: Document, name: str | None) -> int:
     return names.index(name)
 
 
-def nodes_of(document: Document) -> list[dict[str, Any]]:
+def nodes_of(document: Document) -> list[Node]:
     """Return all nodes, checked one by one."""
     entries = entries_of(document.path, document.content, "nodes")
-    return [structure(e, NODE, f"{document.path}: nodes[{i}]", closed=False) for i, e in enumerate(entries)]
+    return [convert(entry, Node, f"{document.path}: nodes[{i}]") for i, entry in enumerate(entries)]
 
 
-def parents_first(document: Document, nodes: list[dict[str, Any]]) -> tuple[list[int], dict[int, int]]:
+def parents_first(document: Document, nodes: list[Node]) -> tuple[list[int], dict[int, int]]:
     """Return the numbers of all nodes, parents before children, and the parent of each child."""
     parents: dict[int, int] = {}
     for i, node in enumerate(nodes):
@@ -85,7 +106,7 @@ def parents_first(document: Document, nodes: list[dict[str, Any]]) -> tuple[list
     return order, parents
 
 
-def tracks_of(document: Document, animation: int, nodes: list[dict[str, Any]], targets: Mapping[int, int]) -> Tracks:
+def tracks_of(document: Document, animation: int, nodes: list[Node], targets: Mapping[int, int]) -> Tracks:
     """Return the tracks of one animation; `targets` has the number of morph targets of each node that has some."""
     where = f"animations[{animation}]"
     entry = entries_of(document.path, document.content, "animations")[animation]
@@ -95,7 +116,7 @@ def tracks_of(document: Document, animation: int, nodes: list[dict[str, Any]], t
     found: Tracks = {}
     for i, channel in enumerate(lists["channels"]):
         place = f"{document.path}: {where}.channels[{i}]"
-        about = structure(channel, CHANNEL, place, closed=False)
+        about = convert(channel, Channel, place)
         node = about["target"].get("node")
         path = about["target"]["path"]
         if node is None or path not in (*PATHS, "weights"):
@@ -109,14 +130,14 @@ def tracks_of(document: Document, animation: int, nodes: list[dict[str, Any]], t
         if (node, path) in found:
             raise ValueError(f"{place}: the {path} of nodes[{node}] has two channels")
         sampler = f"{where}.samplers[{about['sampler']}]"
-        table = structure(lists["samplers"][about["sampler"]], SAMPLER, f"{document.path}: {sampler}", closed=False)
+        table = convert(lists["samplers"][about["sampler"]], TrackSampler, f"{document.path}: {sampler}")
         found[node, path] = _track(document, table, sampler, path, PATHS.get(path) or targets[node])
     if not found:
         raise ValueError(f"{document.path}: {where} moves no node and no morph target")
     return found
 
 
-def _track(document: Document, sampler: Mapping[str, Any], where: str, path: str, numbers: int) -> Track:
+def _track(document: Document, sampler: TrackSampler, where: str, path: str, numbers: int) -> Track:
     """Return the keys of one sampler."""
     times = document.array(sampler["input"], where, "SCALAR")[:, 0].astype(np.float64)
     kind = INTERPOLATION[sampler.get("interpolation", "LINEAR")]
@@ -155,7 +176,7 @@ def check_quaternions(where: str, quaternions: np.ndarray) -> None:
 
 
 def joints_of(
-    document: Document, nodes: list[dict[str, Any]], tracks: Tracks, order: list[int], parents: Mapping[int, int]
+    document: Document, nodes: list[Node], tracks: Tracks, order: list[int], parents: Mapping[int, int]
 ) -> tuple[list[Joint], dict[int, int]]:
     """Return a joint for every node, behind one for the place of the body, and the joint of each node."""
     joints = [Joint(Fixed(np.eye(4)))]
@@ -167,9 +188,10 @@ def joints_of(
     return joints, number
 
 
-def _motion(document: Document, number: int, node: Mapping[str, Any], tracks: Tracks) -> Placed:
+def _motion(document: Document, number: int, node: Node, tracks: Tracks) -> Placed:
     if "matrix" in node:
         return fixed(f"{document.path}: nodes[{number}]", node["matrix"])
-    rest = {path: node.get(path, REST[path]) for path in PATHS}
+    given: dict[str, Any] = {**node}
+    rest = {path: given.get(path, REST[path]) for path in PATHS}
     check_quaternions(f"{document.path}: nodes[{number}]", np.array([rest["rotation"]], np.float64))
     return Keyed(**{path: tracks.get((number, path)) or Track.constant(rest[path]) for path in PATHS})

@@ -33,11 +33,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
-from qsim import checks, files
-from qsim.sensor.defects.fixed_pattern import DarkSpread, FixedPattern
-from qsim.structure import Table, expected, structure, table_of
+from qsim import files
+from qsim.kinds import Digest, NotNegative
+from qsim.records import convert
+from qsim.sensor.defects.fixed_pattern import FixedPattern
 
 _MAPS = {
     "gain_map": "prnu",
@@ -48,14 +49,33 @@ _MAPS = {
 }
 _PATTERN = ("device_seed", "prnu", "dead", "offset", "read_noise")
 _DISTURBANCES = ("crosstalk", "afterpulse", "afterpulse_delay")
-_NOT_NEGATIVE = expected("a number of at least 0", lambda v: type(v) in (int, float) and 0 <= v < float("inf"))
-_FILE = expected("the name of a .npy file", lambda v: isinstance(v, str | Mapping))
-TABLE: Table = {
-    **table_of(FixedPattern),
-    **{f"{key}, if any": _FILE for key in _MAPS},
-    **{f"{key}, if any": _NOT_NEGATIVE for key in _DISTURBANCES},
-    "carry_dead_time, if any": checks.flag,
-}
+
+
+class MapFile(TypedDict):
+    """A measured map as a stream's description states it."""
+
+    file: str
+    sha256: NotRequired[Digest]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Disturbances:
+    """The keys of [defects] beside those of the fixed pattern."""
+
+    gain_map: str | MapFile | None = None
+    dark_map: str | MapFile | None = None
+    dead_map: str | MapFile | None = None
+    offset_map: str | MapFile | None = None
+    read_noise_map: str | MapFile | None = None
+    crosstalk: NotNegative = 0.0
+    afterpulse: NotNegative = 0.0
+    afterpulse_delay: NotNegative = 0.0  # s
+    carry_dead_time: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class DefectKeys(FixedPattern, Disturbances):
+    """The keys of a table [defects]."""
 
 
 @dataclass(frozen=True)
@@ -120,21 +140,20 @@ def from_dict(table: Mapping[str, Any], where: str = "defects") -> Defects:
 
     `ValueError` for unknown keys and invalid values.
     """
-    structure(table, TABLE, where)
+    try:
+        keys = convert(table, DefectKeys, where)
+    except ValueError as error:
+        raise ValueError(str(error).replace("DefectKeys.", "")) from None
     for name, pattern in _MAPS.items():
         if name in table and pattern in table:
             raise ValueError(f"{where}: {pattern} and {name} state the same defect twice; leave one out")
-    try:
-        spread = DarkSpread(**table["dark"]) if "dark" in table else None
-        pattern_of_device = FixedPattern(**{key: table[key] for key in _PATTERN if key in table}, dark=spread)
-    except ValueError as error:
-        raise ValueError(f"{where}: {str(error).removeprefix('FixedPattern.')}") from None
+    own = FixedPattern(**{key: getattr(keys, key) for key in (*_PATTERN, "dark")})
     maps = {key: _map_file(table[key], key, where) for key in _MAPS if key in table}
-    disturbances = {key: float(table[key]) for key in _DISTURBANCES if key in table}
+    disturbances = {key: getattr(keys, key) for key in _DISTURBANCES}
     for key in ("crosstalk", "afterpulse"):
-        if not disturbances.get(key, 0.0) < 1:
+        if not disturbances[key] < 1:
             raise ValueError(f"{where}: {key} must be a probability below 1, got {table[key]!r}")
-    return Defects(pattern_of_device, maps, **disturbances, carry_dead_time=table.get("carry_dead_time", False))
+    return Defects(own, maps, **disturbances, carry_dead_time=keys.carry_dead_time)
 
 
 def _map_file(value: Any, key: str, where: str) -> str:

@@ -27,7 +27,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.structure import make
+from qsim.records import convert
 from quiver.model.config import flag, real_number, whole_number
 from quiver.model.rivals.edges import check_frames, pad_space, reflected
 
@@ -64,7 +64,7 @@ class Bit2BitConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> Self:
         """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return make(cls, values, "bit2bit")
+        return convert(values, cls, "bit2bit")
 
 
 class Split(NamedTuple):

@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.structure import make
+from qsim.records import convert
 from quiver.model.config import flag, whole_number
 from quiver.model.rivals.edges import check_frames, pad_space
 from quiver.model.rivals.noise import numbers, table_of, variance_at
@@ -53,7 +53,7 @@ class EMVDConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> Self:
         """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return make(cls, values, "EMVD")
+        return convert(values, cls, "EMVD")
 
 
 class Fused(NamedTuple):

@@ -19,7 +19,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from qsim.structure import make
+from qsim.records import convert
 from quiver.model.config import flag, whole_number
 from quiver.model.rivals.edges import restored_range
 from quiver.model.rivals.noise import deviation_map, table_of
@@ -48,7 +48,7 @@ class FastDVDnetConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> Self:
         """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return make(cls, values, "FastDVDnet")
+        return convert(values, cls, "FastDVDnet")
 
 
 class FastDVDnet(nn.Module):

@@ -30,7 +30,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.structure import make
+from qsim.records import convert
 from quiver.model.blocks import FlowNetwork
 from quiver.model.config import FLOW_LAYERS, flag, real_number, whole_number
 from quiver.model.deformable import warp
@@ -82,7 +82,7 @@ class FloRNNConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> Self:
         """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return make(cls, values, "FloRNN")
+        return convert(values, cls, "FloRNN")
 
 
 class Flows(NamedTuple):

@@ -24,7 +24,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.structure import make
+from qsim.records import convert
 from quiver.model.blocks import conv, join, resize, upsample
 from quiver.model.config import flag, whole_number
 from quiver.model.rivals.edges import check_frames, pad_space
@@ -64,7 +64,7 @@ class MemDeblurConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> Self:
         """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return make(cls, values, "MemDeblur")
+        return convert(values, cls, "MemDeblur")
 
 
 class Clip(NamedTuple):

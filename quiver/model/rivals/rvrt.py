@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.structure import make
+from qsim.records import convert
 from quiver.model.config import whole_number
 from quiver.model.deformable import warp
 from quiver.model.ops.deformable_attention import deformable_attention
@@ -63,7 +63,7 @@ class RVRTConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> Self:
         """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return make(cls, values, "RVRT")
+        return convert(values, cls, "RVRT")
 
 
 class Guides(NamedTuple):

@@ -22,7 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.structure import make
+from qsim.records import convert
 from quiver.model.config import flag, whole_number
 from quiver.model.deformable import deform_conv2d
 from quiver.model.rivals.edges import restored_range
@@ -65,7 +65,7 @@ class Spk2ImgNetConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> Self:
         """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return make(cls, values, "Spk2ImgNet")
+        return convert(values, cls, "Spk2ImgNet")
 
 
 class Extracted(NamedTuple):

@@ -21,7 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.structure import make
+from qsim.records import convert
 from quiver.model.blocks import RADIUS, WINDOW, conv
 from quiver.model.config import flag, whole_number
 from quiver.model.rivals.edges import restored_range
@@ -50,7 +50,7 @@ class StudentTeacherConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> Self:
         """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return make(cls, values, "Student-Teacher")
+        return convert(values, cls, "Student-Teacher")
 
 
 class Features(NamedTuple):

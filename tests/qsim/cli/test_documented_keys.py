@@ -5,10 +5,10 @@ from dataclasses import fields
 
 import pytest
 
+from qsim import records
 from qsim.cli import documented_keys
 from qsim.cli.program import main
-from qsim.dataset import recipe
-from qsim.dataset.recipe_sections import scenes_section, streams_section
+from qsim.dataset import recipe, recipe_file
 from qsim.sensor import devices, file_laws
 from qsim.sensor.defects import defect_table
 
@@ -22,10 +22,9 @@ def printed(words, capsys):
 
 def test_every_key_of_a_recipe_is_printed(capsys):
     found = printed(["recipes", "--keys"], capsys)
-    tables = {"[recipe]": recipe.HEAD, "[[scenes]]": scenes_section.SCENES, "[[streams]]": streams_section.STREAMS}
-    assert set(found) == set(tables)
-    for section, checks in tables.items():
-        assert set(found[section]) == {key.removesuffix(", if any") for key in checks}
+    assert set(found) == set(recipe_file.SECTIONS)
+    for section, record in recipe_file.SECTIONS.items():
+        assert set(found[section]) == set(records.hints_of(record))
         assert all(row["meaning"] and row["accepts"] for row in found[section].values())
     assert found["[recipe]"]["reuse"]["meaning"].endswith("default: where a trial costs little against the clip")
 
@@ -37,8 +36,7 @@ def test_every_key_of_a_sensor_file_is_printed(capsys):
         assert set(found[f"[sensor] of a {model}"]) == {"model", *(field.name for field in fields(kind))}
         assert found[f"[sensor] of a {model}"]["model"]["meaning"]
     assert set(found["[sensor] of any model, laws"]) == {*file_laws.KEYS, "iso"}
-    entries = {key.removesuffix(", if any") for key, _ in documented_keys.flat(defect_table.TABLE)}
-    assert set(found["[defects]"]) == entries
+    assert set(found["[defects]"]) == {key for key, *_ in documented_keys.flat(defect_table.DefectKeys)}
     assert set(found["[colour]"]) == {"mask", *(f"efficiency.{colour}" for colour in "RGBW")}
     meanings = [row["meaning"] for rows in found.values() for row in rows.values() if row["name"] != "bits"]
     assert all(meanings)

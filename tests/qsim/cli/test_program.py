@@ -15,8 +15,8 @@ from typing import Any
 import fakes
 import numpy as np
 import pytest
+from clips import describe_video
 
-from qsim import files
 from qsim.cli import dataset
 from qsim.cli.program import main
 from qsim.clip.clip_info import RELATIVE
@@ -367,8 +367,7 @@ def test_defaults_of_a_recipe_and_applied_defects_are_printed(tmp_path, capsys, 
 
 def test_restored_video_states_its_own_rates(tmp_path, capsys):
     np.save(tmp_path / "video.npy", np.ones((3, 8, 10), np.float32))
-    description = {"seconds_per_frame": 0.1, "frame_rate": 1000.0, "exposure": 2e-4, "method": "moment"}
-    files.write_description(tmp_path / "video.json", description)
+    describe_video(tmp_path / "video.json", frame_rate=1000.0, exposure=2e-4)
     code, out, _ = run(capsys, "convert", tmp_path / "video.npy", tmp_path / "clip")
     assert code == 0
     assert "3 frames of 8 x 10 pixels at 1000 per second, exposure 200 us" in out

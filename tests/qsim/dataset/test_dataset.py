@@ -27,9 +27,9 @@ def test_a_finished_data_set(tmp_path: Path):
     assert [clip.name for clip in found.clips()] == ["fan_0000", "fan_0001", "tumble_0004"]
     assert [clip.name for clip in found.clips("test")] == ["tumble_0004"]
     assert found.clips("val") == []
-    assert found.meta["complete"] is True
+    assert found.info.complete
     assert found.missing == found.verify() == []
-    assert found.recipe["recipe"]["frames"] == 3
+    assert found.recipe.recipe.frames == 3
     clip = found.clips()[1]
     assert clip.streams == ("quiver-physical_1bit_3.25ppp", "quiver-physical_3bit_3.25ppp")
     assert clip.info.split == "train"

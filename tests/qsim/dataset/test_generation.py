@@ -96,7 +96,7 @@ def test_a_failing_job_is_listed_and_retried(tmp_path: Path, undisturbed: dict[s
     why = "scene tumble: no light and no glowing body"
     first = generate(SMALL, tmp_path / "d", HERE, make=fail_on_tumble)
     assert (first.done, first.failed) == (2, {"tumble_0004": why})
-    assert Dataset.open(tmp_path / "d").meta["jobs"]["tumble_0004"]["state"] == "failed"
+    assert Dataset.open(tmp_path / "d").info.jobs["tumble_0004"].state == "failed"
     again = generate(SMALL, tmp_path / "d", HERE, make=make)
     assert (again.made, again.failed) == (0, {"tumble_0004": why}), "it is retried only when asked"
     assert "ValueError" in (tmp_path / "d" / "logs" / "tumble_0004.log").read_text()
@@ -284,7 +284,7 @@ LIES = {  # name -> what a worker does to a job's files before it reports "done"
     ),
     "no clip": lambda folder, record: shutil.rmtree(folder / "clips" / "fan_0000"),
     "another clip.json": lambda folder, record: first(folder, "clip.json").write_text(
-        first(folder, "clip.json").read_text() + " "
+        first(folder, "clip.json").read_text().replace('"frame_rate": 2000', '"frame_rate": 2001')
     ),
     "a missing frame": lambda folder, record: first(folder, "radiance/*.exr").unlink(),
     "an empty frame": lambda folder, record: first(folder, "truth/*.exr").write_bytes(b""),
@@ -313,7 +313,7 @@ def test_an_answer_counts_only_when_its_files_agree(tmp_path: Path, lie: str):
     assert found.failed["fan_0000"].startswith("a worker reports that it is done, but ")
     opened = Dataset.open(folder)
     assert opened.names() == ["fan_0001", "tumble_0004"]
-    assert opened.meta["jobs"]["fan_0000"]["state"] == "failed"
+    assert opened.info.jobs["fan_0000"].state == "failed"
 
 
 def test_an_answer_for_a_job_that_nobody_asked_for(tmp_path: Path):

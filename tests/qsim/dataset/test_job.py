@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from qsim.dataset import recipe
-from qsim.dataset.job import Job, Settings
+from qsim.dataset.job import Job
+from qsim.rendering.render_settings import RenderSettings
 from qsim.streams.sensing import Sensing
 
 FILTERS = '[colour]\nmask = "rggb"\nefficiency.R = 0.4\nefficiency.G = 0.6\nefficiency.B = 0.5\n'
@@ -52,7 +53,7 @@ def test_filters_and_measured_maps_decide_the_digest_and_their_folder_does_not(t
 
 def test_a_setting_that_is_off_changes_no_digest():
     """Not even one that does not exist yet: a record with one more field of any default has the same digest."""
-    settings = Settings(frames=3, height=8, width=9, frame_rate=2000.0)
+    settings = RenderSettings(frames=3, height=8, width=9, frame_rate=2000.0)
     stream = Sensing("quiver-physical", bits=3, ppp=3.25)
     job = Job("a", "fan", 1, 1.0, "train", settings, 7, (stream,))
     for record, name in ((settings, "settings"), (stream, "streams")):

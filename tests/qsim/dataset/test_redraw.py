@@ -7,15 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clips import write_clip, write_dataset
+from clips import describe_video, write_clip, write_dataset
 from scipy.special import gammaln
 
 from qsim import files
 from qsim.cli import program
-from qsim.dataset import redraw
+from qsim.dataset import checking
 from qsim.dataset.generation import Options, generate
-from qsim.dataset.job import Job, Settings
+from qsim.dataset.job import Job
 from qsim.dataset.recipe import Recipe
+from qsim.rendering.render_settings import RenderSettings
 from qsim.sensor.qis import QIS
 from qsim.streams.clip import Clip
 from qsim.streams.sensing import Sensing, prepare, sense, write_stream
@@ -89,14 +90,14 @@ def test_right_streams_pass_and_wrong_codes_are_counted(clip, tmp_path, kind):
     """With flipped codes in frames 1 and 2, all files still match their checksums."""
     stream = drawn(clip, tmp_path, kind)
     assert stream.meta["drawn_by"] == KINDS[kind][2]
-    (found,) = redraw.redraw(stream.path)
+    (found,) = checking.redraw(stream.path)
     assert (found.differ, found.why, found.wrong) == (0, None, False)
     wrong = stream.codes()
     wrong[1, 2, 3:5] ^= 1
     wrong[min(2, len(wrong) - 1), 9, 12] ^= 1
     stored_again(clip, stream, wrong)
     assert clip.verify() == []
-    (found,) = redraw.redraw(clip.path)
+    (found,) = checking.redraw(clip.path)
     assert (found.codes, found.differ, found.first) == (wrong.size, 3, 1)
     assert found.wrong
 
@@ -104,7 +105,7 @@ def test_right_streams_pass_and_wrong_codes_are_counted(clip, tmp_path, kind):
 def test_an_unknown_law_is_refused(clip, tmp_path):
     stream = drawn(clip, tmp_path, "QIS")
     old = stored_again(clip, stream, stream.codes(), drawn_by="magic")
-    (found,) = redraw.redraw(old.path)
+    (found,) = checking.redraw(old.path)
     assert found.why == (
         "drawn by 'magic', which is none of table, process, planes, closed form, events, spikes; sense it again"
     )
@@ -188,8 +189,7 @@ def test_streams_beside_no_clip_and_restored_video_do_not_end_the_check(clip, tm
     for end in (".npy", ".json"):
         shutil.copy(stream.path.with_suffix(end), moved.with_suffix(end))
     np.save(video, np.ones(stream.shape, np.float32))
-    described = {"method": "moment", "seconds_per_frame": 0.1, "sha256": files.sha256(video)}
-    files.write_description(video.with_suffix(".json"), described)
+    describe_video(video.with_suffix(".json"), sha256=files.sha256(video))
     assert program.main(["check", *map(str, (stream.path, capture, moved, video)), "--redraw"]) == 0
     out = capsys.readouterr().out
     assert f"{capture}: not drawn again: its description holds no seed" in out
@@ -198,7 +198,7 @@ def test_streams_beside_no_clip_and_restored_video_do_not_end_the_check(clip, tm
 
 
 def test_a_few_codes_in_a_million_are_the_compiled_engines_own():
-    few = redraw.Redrawn(Path("s.npy"), 1_000_000, 5, 3)
+    few = checking.Redrawn(Path("s.npy"), 1_000_000, 5, 3)
     assert not few.wrong
     assert few.line() == "s.npy: 5 of 1000000 codes differ from the reference's, as many as the compiled engine may"
     assert replace(few, differ=6).wrong
@@ -208,7 +208,7 @@ def test_a_data_set_is_drawn_again_clip_by_clip(tmp_path, capsys):
     """Streams added by `qsim sense`: each is named with its clip, and passes after --force."""
     path = write_dataset(tmp_path / "set", {"train": 2, "test": 1})
     assert program.main(["sense", str(path), "--bits", "3", "--ppp", "3.25", "-o", "s"]) == 0
-    found = redraw.redraw(path)
+    found = checking.redraw(path)
     assert len(found) == 3
     assert not any(one.differ for one in found)
     clip = Clip.open(path / "clips" / "train_1")
@@ -240,9 +240,9 @@ def test_a_damaged_clip_is_named_and_the_others_are_drawn_again(tmp_path, capsys
 
 def test_what_is_said_of_a_recipes_streams_mends_them(tmp_path, capsys):
     """Every checksum fits the wrong codes; when the file is deleted, `generate --repair` draws them again."""
-    settings = Settings(frames=14, height=36, width=44, frame_rate=2000.0)
+    settings = RenderSettings(frames=14, height=36, width=44, frame_rate=2000.0)
     sensing = Sensing("quiver-physical", bits=3, ppp=3.25, name="s")
-    recipe = Recipe("tiny", (Job("one", "family", 0, 1.0, "train", settings, 0, (sensing,)),), {})
+    recipe = Recipe("tiny", (Job("one", "family", 0, 1.0, "train", settings, 0, (sensing,)),))
 
     def make(job: Job, target: Path, wrong: bool) -> Clip:
         clip = write_clip(target, job=job.digest)

@@ -4,9 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from clips import square_clip
+from clips import describe_video, square_clip
 
-from qsim import files
 from qsim.cli.program import main
 from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
@@ -39,15 +38,8 @@ def folder(tmp_path_factory):
     clip = square_clip(top / "square")
     assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3"]) == 0
     stream = Clip.open(clip.path).stream(Clip.open(clip.path).streams[0])
-    restored = {
-        "format": "quiver-restored-1",
-        "method": "moment",
-        "description": "moment inverse",
-        "seconds_per_frame": 0.1,
-        "source": str(stream.path),
-    }
     np.save(top / "video.npy", np.full(clip.shape, 3.25, np.float32))
-    files.write_description(top / "video.json", restored)
+    describe_video(top / "video.json", description="moment inverse", source=str(stream.path))
     entry = {"step": 10, "elapsed": 60.0, "psnr_matched": 21.5}
     (top / "history.json").write_text(json.dumps({"settings": {}, "history": [entry, entry | {"elapsed": 120.0}]}))
     interval = {"mean": 20.0, "half_width": 1.0, "scenes": 2}

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from clips import colour_clip, square_clip, write_clip
+from clips import colour_clip, describe_video, square_clip, write_clip
 from stats import mixture_p_value
 
-from qsim import files
 from qsim.cli.program import main
 from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
@@ -165,9 +164,8 @@ def test_numbers_of_the_first_frames_are_not_those_of_the_clip(tmp_path):
     assert f"motion between successive frames, all pixels {which} frames" in body
     assert f"light of the recorded video, all pixels {which} frames" in body
     assert f"codes of mine {which} frames: drawn" in body
-    about = {"format": "quiver-restored-1", "method": "moment", "seconds_per_frame": 0.1, "source": str(stream.path)}
     np.save(tmp_path / "v.npy", np.full(stream.shape, 3.25, np.float32))
-    files.write_description(tmp_path / "v.json", about)
+    describe_video(tmp_path / "v.json", source=str(stream.path))
     section = report.restored_section(tmp_path / "v.json")
     assert section.story.endswith(f"PSNR {which} frames.")
     assert section.facts[0].what == f"PSNR of v {which} frames"

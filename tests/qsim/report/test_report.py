@@ -6,9 +6,8 @@ import re
 import numpy as np
 import pytest
 from browser import browser, needs_chromium
-from clips import write_clip, write_dataset
+from clips import describe_video, write_clip, write_dataset
 
-from qsim import files
 from qsim.cli.program import main
 from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
@@ -53,10 +52,8 @@ def test_ground_truth_lies_over_restored_video(tmp_path):
         for t in range(3):
             writer.add(t, light[t], truth=truth, error=0.01)
     stream = Clip.open(tmp_path / "c").sense(ppp=3.25, bits=3)
-    about = {"format": "quiver-restored-1", "method": "moment", "description": "moment inverse"}
-    about |= {"seconds_per_frame": 0.1, "source": str(stream.path)}
     np.save(tmp_path / "v.npy", light)
-    files.write_description(tmp_path / "v.json", about)
+    describe_video(tmp_path / "v.json", description="moment inverse", source=str(stream.path))
     body = report.restored_section(tmp_path / "v.json").body
     for words in ("restored by moment", "flow, full colour", "depth, 1 m", "bodies, one colour", "red: hidden"):
         assert words in body, words
@@ -130,8 +127,7 @@ def test_a_portrait_of_many_frames_has_a_page(tmp_path):
     clip = write_clip(tmp_path / "tall", radiance=np.full((48, 768, 2), 0.5), relative=True)
     stream = clip.sense(ppp=3.25, bits=3)
     np.save(tmp_path / "v.npy", np.full((48, 3, 768, 2), 3.25, np.float32))
-    about = {"format": "quiver-restored-1", "method": "moment", "seconds_per_frame": 0.1}
-    files.write_description(tmp_path / "v.json", about)
+    describe_video(tmp_path / "v.json")
     page = report.build_page(clip.path, tmp_path / "v.npy")
     assert page.count('data-frames="41"') == page.count('class="player"') == 2
     assert stream.name in page
@@ -225,16 +221,16 @@ def test_video_of_a_replaced_stream_is_not_scored_against_it(tmp_path):
     clip = write_clip(tmp_path / "c", frames=4, height=12, width=14)
     stream = clip.sense(ppp=3.25, bits=3, name="s")
     np.save(tmp_path / "v.npy", np.full((4, 12, 14), 3.25, np.float32))
-    about = {"format": "quiver-restored-1", "method": "moment", "seconds_per_frame": 0.1, "source": str(stream.path)}
-    known = {"shape": [4, 12, 14], "source_sha256": stream.meta["sha256"]}
+    about = {"source": str(stream.path)}
+    known = {"shape": (4, 12, 14), "source_sha256": stream.meta["sha256"]}
     for changes, scored in (
         (known, True),
         (known | {"source_sha256": "0" * 64}, False),
     ):
-        files.write_description(tmp_path / "v.json", about | changes)
+        describe_video(tmp_path / "v.json", **about, **changes)
         body = report.restored_section(tmp_path / "v.json").body
         assert ("both clamped at" in body) == scored
         assert ("Its stream was replaced since" in body) != scored
     clip.sense(ppp=9.75, bits=3, name="s", force=True)
-    files.write_description(tmp_path / "v.json", about | known)
+    describe_video(tmp_path / "v.json", **about, **known)
     assert "Its stream was replaced since" in report.restored_section(tmp_path / "v.json").body

@@ -1,10 +1,9 @@
 """Tests that views are the declared functions of the numbers."""
 
 import numpy as np
-from clips import square_clip, write_clip
+from clips import describe_video, square_clip, write_clip
 
 from qsim import colour as pictures
-from qsim import files
 from qsim.cli.program import main
 from qsim.report.views import Source, open_source
 from qsim.sensor import packing
@@ -34,8 +33,7 @@ def test_average_is_of_the_frames_around(clip):
 
 def test_restored_video_names_its_method(tmp_path):
     np.save(tmp_path / "video.npy", np.full((3, 4, 5), 6.5, np.float32))
-    described = {"format": "quiver-restored-1", "method": "moment", "unit": "photons", "frame_rate": 2000.0}
-    files.write_description(tmp_path / "video.json", described)
+    describe_video(tmp_path / "video.json", frame_rate=2000.0)
     view = open_source(tmp_path / "video.npy").views["values"]
     assert view.declared.startswith("restored by moment: brightest shown = 6.5 photons")
     assert (view.picture(0) == 255).all()

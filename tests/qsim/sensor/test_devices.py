@@ -146,9 +146,9 @@ GOOD = {"model": '"BinarySPAD"', "pde": "0.3", "dark_count_rate": "25", "bits": 
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"pdee": "0.3"}, "mine.toml: [sensor]: unknown key 'pdee' in BinarySPAD (did you mean 'pde'?)"),
+        ({"pdee": "0.3"}, "mine.toml: [sensor]: unknown key 'pdee' (did you mean 'pde'?)"),
         ({"model": '"BinarySpad"'}, "got 'BinarySpad' (did you mean 'BinarySPAD'?)"),
-        ({"pde": None}, "mine.toml: [sensor]: key 'pde' is missing in BinarySPAD"),
+        ({"pde": None}, "mine.toml: [sensor]: key 'pde' is missing"),
         ({"pde": '"0.3"'}, "pde: expected a number, got '0.3'"),
         ({"bits": "1.0"}, "bits: expected a whole number, got 1.0"),
         ({"bits": "true"}, "bits: expected a whole number, got True"),

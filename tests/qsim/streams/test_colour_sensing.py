@@ -8,8 +8,8 @@ from clips import colour_clip, write_clip
 from PIL import Image
 
 from qsim.cli import main
+from qsim.dataset.checking import redraw
 from qsim.dataset.recipe import load
-from qsim.dataset.redraw import redraw
 from qsim.keys import Key, hash_name
 from qsim.optics.radiometry import RGB
 from qsim.sensor.colour_filter import ColourFilter
@@ -172,7 +172,9 @@ def test_a_recipe_names_its_filters(place):
     colour = '[[streams]]\nsensor = "quiver-physical"\nppp = 3\ncolour = "rggb"\n'
     with pytest.raises(ValueError, match="quiver-physical-rggb_3ppp: has one band, and the sensor has colour filters"):
         recipe.parse(head.replace('bands = "rgb"\n', "") + colour)
-    with pytest.raises(ValueError, match=r"recipe\.toml:12: unknown colour filter array 'x'"):
+    with pytest.raises(
+        ValueError, match=r"recipe\.toml: streams\[0\] of scenes\[0\]: .*unknown colour filter array 'x'"
+    ):
         recipe.parse(head + '[[streams]]\nsensor = "quiver-physical"\nppp = 3\ncolour = "x"\n')
 
 

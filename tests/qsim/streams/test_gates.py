@@ -7,7 +7,7 @@ import pytest
 from clips import write_clip
 from stats import assert_mean
 
-from qsim.dataset.redraw import redraw
+from qsim.dataset.checking import redraw
 from qsim.formats.challenge import bands_of
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.defect_table import Defects

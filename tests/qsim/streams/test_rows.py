@@ -9,7 +9,7 @@ import pytest
 from clips import sliding_pattern, write_clip
 
 from qsim.checks import ROW_ORDERS
-from qsim.dataset.redraw import redraw
+from qsim.dataset.checking import redraw
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from clips import describe_video
 from golden import published_state
 from safetensors.torch import save_file
 
-from qsim import colour, files
+from qsim import colour
 from qsim.cli.options import memory_size
 from qsim.cli.program import main as qsim_main
 from qsim.locks import Lock
@@ -199,7 +200,7 @@ def test_arrays_that_are_no_stream_are_refused(capsys, tmp_path, array, message)
 
 def test_restored_video_is_not_taken_for_a_stream(capsys, tmp_path):
     np.save(tmp_path / "v.npy", np.ones((3, 4, 4), np.float32))
-    files.write_description(tmp_path / "v.json", {"method": "moment", "seconds_per_frame": 0.1})
+    describe_video(tmp_path / "v.json")
     said = mistake(capsys, "restore", tmp_path / "v.npy", "-o", tmp_path / "w.npy", "--method", "moment")
     assert "v.npy: is restored video; name the stream" in said
     assert not (tmp_path / "w.npy").exists()

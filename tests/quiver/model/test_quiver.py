@@ -40,9 +40,9 @@ def test_wrong_names_and_settings_say_what_is_right():
         Config(denoiser_growth=0)
     with pytest.raises(ValueError, match=r"Config\.flow_channels must be 1 to 8 widths, got \(\)"):
         Config(flow_channels=())
-    with pytest.raises(ValueError, match="unknown key 'chanels' in Config"):
+    with pytest.raises(ValueError, match="QUIVER: unknown key 'chanels'"):
         Config.from_dict({"chanels": 3})
-    with pytest.raises(ValueError, match="unknown key 'depth' in UNetConfig"):
+    with pytest.raises(ValueError, match="UNet: unknown key 'depth'"):
         UNetConfig.from_dict({"depth": 3})
     assert Config.from_dict(SMALL.to_dict()) == SMALL
     assert Config.from_dict(Config(32).to_dict()) == Config(32)

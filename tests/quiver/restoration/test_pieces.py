@@ -143,10 +143,10 @@ def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path, monkeypa
     assert all(tile.y % 16 == tile.x % 16 == 0 for tile in cut.tiles)
     method = network_restorer(path, RestoreOptions(memory=memory))
     with pytest.warns(UserWarning, match="differ where they overlap by") as caught:
-        meta = restore_to_file(codes, method, tmp_path / "r.npy")
+        info = restore_to_file(codes, method, tmp_path / "r.npy")
     text = str(caught[0].message)
     assert cut.text in text
-    assert meta["identity"]["cut"] == cut.text
+    assert info.identity["cut"] == cut.text
     said = float(re.search(r"by ([0-9.e-]+) % of white rms", text)[1]) / 100  # type: ignore[index]
     whole = quiet(network_restorer(path, RestoreOptions(memory=10**10)), codes)
     found = float(np.sqrt(np.mean((np.load(tmp_path / "r.npy") - whole) ** 2))) / codes.white

@@ -29,7 +29,7 @@ from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import annotate, save
 from quiver.restoration import restored_file, restorers
 from quiver.restoration.interface import RestoreOptions, Restorer
-from quiver.restoration.restored_file import FORMAT, restore_to_file
+from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import restorer
 
 SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
@@ -164,7 +164,7 @@ def test_damaged_notes_are_no_obstacle(tmp_path, blocks_of_four):
     moment = restorer("moment")
     for done in (None, "many"):
         interrupted(codes, moment, tmp_path / "r.npy")
-        (tmp_path / "r.npy.part.json").write_text(json.dumps({"format": FORMAT, "done": done}))
+        (tmp_path / "r.npy.part.json").write_text(json.dumps({"format": "quiver-unfinished", "done": done}))
         starts, said = resumed(codes, moment, tmp_path / "r.npy")
         assert starts == [0, 4, 8]
         assert "starting again" in said[0]

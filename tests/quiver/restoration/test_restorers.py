@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +10,7 @@ from clips import ClipMaker
 from numpy import ndarray as Array
 from random_codes import EXPOSURE, SENSOR, random_codes
 
+from qsim.restored_video import Restored
 from quiver.baselines import METHODS
 from quiver.data.clips import truth
 from quiver.data.codes import Codes, sensed
@@ -109,13 +109,13 @@ def test_a_run_has_the_name_of_its_folder_from_any_folder(tmp_path, monkeypatch)
 def test_a_restored_file_says_what_it_is(tmp_path):
     codes = random_codes(5, 6, 7)
     path = tmp_path / "video.npy"
-    meta = restore_to_file(codes, restorer("moment"), path)
+    info = restore_to_file(codes, restorer("moment"), path)
     stored = np.load(path)
     assert stored.dtype == np.float32
     np.testing.assert_array_equal(stored, restorer("moment").restore(codes))
-    assert json.loads((tmp_path / "video.json").read_text()) == meta
-    assert (meta["method"], meta["unit"], meta["shape"]) == ("moment", "photons", [5, 6, 7])
-    assert meta["white"] == pytest.approx(8.125)
+    assert Restored.open(tmp_path / "video.json").info == info
+    assert (info.method, info.unit, info.shape) == ("moment", "photons", (5, 6, 7))
+    assert info.white == pytest.approx(8.125)
 
 
 def test_a_failed_restoration_leaves_nothing(tmp_path):

@@ -405,7 +405,7 @@ REFUSED = {
     "times fall": (lambda file: sampler(file).update(input=file.add([1.0, 1.0])), "Track.times must increase, got 1 s"),
     "times before 0": (lambda file: sampler(file).update(input=file.add([-1.0, 1.0])), "its first key is at -1 s"),
     "spline of two": (lambda file: sampler(file).update(interpolation="CUBICSPLINE"), "needs 6 of VEC4, but"),
-    "interpolation": (lambda file: sampler(file).update(interpolation="CURVE"), "expected STEP, LINEAR or"),
+    "interpolation": (lambda file: sampler(file).update(interpolation="CURVE"), "expected one of STEP, LINEAR"),
     "twice": (lambda file: file.content["animations"][0].update(channels=2 * file.content["animations"][0]["channels"]),
               r"the rotation of nodes\[1\] has two channels"),
     "keys of a matrix": (put("nodes.1", {"matrix": np.eye(4).ravel().tolist()}), r"nodes\[1\], which has a matrix"),

@@ -10,7 +10,7 @@ from waves import SIZE, wave_clip
 from qsim import records
 from qsim.cli.program import main
 from qsim.clip.clip_info import SceneName
-from qsim.dataset.redraw import redraw
+from qsim.dataset.checking import redraw
 from qsim.rendering import clip_rendering, fidelity
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons, light_level

@@ -1,13 +1,11 @@
-"""Tests the tables of JSON and TOML files: a changed digit is found, and every error is one line."""
+"""Descriptions: a changed digit is found, a hostile value is refused in one line, and bombs do not go off."""
 
 import json
 import random
-import re
 import shutil
 import tomllib
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +13,9 @@ import fakes
 import numpy as np
 import pytest
 from clips import write_clip
+from mutations import at, places, replaced
 
-from qsim import checks, files
+from qsim import files
 from qsim.cli.program import main
 from qsim.dataset import checking, generation, recipe
 from qsim.dataset.dataset import Dataset
@@ -27,7 +26,6 @@ from qsim.report import report, views
 from qsim.streams.clip import Clip
 from qsim.streams.sensing import Sensing, replay, sense
 from qsim.streams.stream import Stream
-from qsim.structure import make, structure
 from quiver.data import codes as data
 from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import restorer
@@ -75,27 +73,6 @@ def test_json_holds_finite_numbers(tmp_path: Path, number: str):
     assert files.read_json(tmp_path / "a.json") == {"a": [1, 2**64 - 1, -1e308]}
 
 
-def places(value: Any, inside: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The paths of all values in a JSON object, leaves and branches."""
-    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, item in pairs:
-        yield (*inside, key)
-        yield from places(item, (*inside, key))
-
-
-def at(value: Any, place: tuple[Any, ...]) -> Any:
-    for key in place:
-        value = value[key]
-    return value
-
-
-def changed(value: Any, place: tuple[Any, ...], to: Any) -> Any:
-    """A copy of a JSON object with another value in one place."""
-    copy = json.loads(json.dumps(value))
-    at(copy, place[:-1])[place[-1]] = to
-    return copy
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A clip with a stream, a data set with one that `qsim sense` added, a stream beside no clip, restored video."""
@@ -135,7 +112,7 @@ def test_every_changed_number_is_found(made: Path):
             value = at(found, place)
             if place in (("format_version",),):
                 continue  # refused with both numbers: test_clip.py
-            description.write_bytes(files.to_json(changed(found, place, value * 1.1 if value % 1 else value + 1)))
+            description.write_bytes(files.to_json(replaced(found, place, value * 1.1 if value % 1 else value + 1)))
             try:
                 said = checking.check(whole)
             except ValueError as error:  # of dataset.json: exit code 2
@@ -211,7 +188,7 @@ def hostile_descriptions(made: Path, folder: Path, wanted: int | None, *uses: Ca
     refused = 0
     for path, place, value in chosen:
         before = path.read_bytes()
-        found = changed(json.loads(before), place, value)
+        found = replaced(json.loads(before), place, value)
         if value == "GONE":
             inside = at(found, place[:-1])
             inside.pop(place[-1])
@@ -246,59 +223,6 @@ def test_every_value_of_another_kind_is_one_line(made: Path, tmp_path: Path):
 @pytest.mark.slow
 def test_reports_of_values_of_another_kind(made: Path, tmp_path: Path):
     hostile_descriptions(made, tmp_path, 400, use_report)
-
-
-@dataclass(frozen=True)
-class Inner:
-    rate: float
-    names: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True)
-class Outer:
-    bits: int
-    inner: Inner | None = None
-    gain: float | None = None
-    on: bool = False
-
-    def __post_init__(self) -> None:
-        if self.bits > 16:
-            raise ValueError(f"Outer.bits is at most 16, got {self.bits}")
-
-
-def test_a_dataclass_is_made_by_the_types_of_its_fields():
-    assert make(Outer, {"bits": 3, "gain": 2}, "a.toml") == Outer(3, gain=2.0)
-    assert make(Inner, {"rate": 1, "names": [2, 3]}, "a.toml") == Inner(1.0, (2, 3))
-
-
-@pytest.mark.parametrize(
-    ("found", "words"),
-    [
-        ({"bit": 3}, "a.toml: unknown key 'bit' in Outer (did you mean 'bits'?); known are bits, inner, gain, on"),
-        ({"on": True}, "a.toml: key 'bits' is missing in Outer"),
-        ({"bits": 3.0}, "a.toml: bits: expected a whole number, got 3.0"),
-        ({"bits": 3, "on": 1}, "a.toml: on: expected true or false, got 1"),
-        ({"bits": 3, "gain": 10**5000}, "a.toml: gain: int too large to convert to float"),
-        ({"bits": 3, "inner": {"rates": 1}}, "a.toml: unknown key 'inner.rates' in Outer (did you mean 'rate'?)"),
-        ({"bits": 3, "inner": 4}, "a.toml: inner: expected a table of values, got 4"),
-        ({"bits": 17}, "a.toml: Outer.bits is at most 16, got 17"),
-        ([], "a.toml: expected a table of values, got []"),
-    ],
-)
-def test_what_a_dataclass_refuses_is_named_with_place_and_key(found: Any, words: str):
-    with pytest.raises(ValueError, match=re.escape(words)):
-        make(Outer, found, "a.toml")
-
-
-def test_the_place_of_a_key_can_be_its_line():
-    def where(key: str | None) -> str:
-        return f"a.toml:{ {None: 1, 'x': 2}[key] }"
-
-    with pytest.raises(ValueError, match=r"^a\.toml:2: x: expected a number, got 'y'; do this$"):
-        structure({"x": "y"}, {"x": checks.real}, where, cure="do this")
-    with pytest.raises(ValueError, match=r"^a\.toml:1: key 'x' is missing in it$"):
-        structure({}, {"x": checks.real}, where, of="it")
-    assert structure({"x": None, "z": 1}, {"x or null": checks.real}, "a", closed=False) == {"x": None, "z": 1}
 
 
 def test_a_byte_order_mark_is_skipped(tmp_path):

@@ -1,0 +1,125 @@
+"""The record of a finished job, jobs/NAME.json: written last, so that a clip counts as finished when its record exists.
+
+Each file has one checksum: clip.json holds those of the frames, the description of a stream that of its codes, and
+every description (record and manifest included) that of its own keys.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from qsim import descriptions, files, records
+from qsim.dataset.job import Job
+from qsim.kinds import Digest, Name, Split, Text
+from qsim.streams.clip import Clip
+
+CURE = "`qsim generate RECIPE -o FOLDER --repair` makes it again"
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobInfo:
+    """A job as the manifest of a data set lists it."""
+
+    split: Split
+    digest: str  # of everything that decides the job's files
+    scene: str = ""  # FAMILY:SEED
+    state: Literal["missing", "failed", "done"] = "missing"
+    error: str = ""  # why it failed
+
+    def __post_init__(self) -> None:
+        records.settle(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobRecord:
+    """What a finished job made."""
+
+    name: Name
+    digest: Digest
+    split: Split
+    streams: tuple[Name, ...] = ()
+
+    @classmethod
+    def of(cls, job: Job) -> JobRecord:
+        """Return the record of a job when all its files are written."""
+        return cls(
+            name=job.name,
+            digest=job.digest,
+            split=job.split,
+            streams=tuple(sensing.stream_name for sensing in job.streams),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """The note of a job that failed, failed/NAME.json."""
+
+    name: Name
+    digest: Digest
+    error: Text
+
+
+def record_path(folder: Path, name: str) -> Path:
+    """Return the path of the record; the job is done when it exists."""
+    return folder / "jobs" / f"{name}.json"
+
+
+def failure_path(folder: Path, name: str) -> Path:
+    """Return the path of the file that holds the reason of a failure."""
+    return folder / "failed" / f"{name}.json"
+
+
+def read_record(path: Path) -> JobRecord:
+    """Return the record in a file; `ValueError` if it is damaged."""
+    return descriptions.read(path, JobRecord, CURE)
+
+
+def verify_job(folder: Path, name: str, expected: JobInfo) -> list[str]:
+    """Return the problems of one finished job's files; `expected` is its entry in the manifest."""
+    path = record_path(folder, name)
+    place = folder / "clips" / name
+    problems: list[str] = []
+    streams: tuple[str, ...] = ()
+    try:
+        record = read_record(path)
+        if (record.name, record.digest, record.split) == (name, expected.digest, expected.split):
+            streams = record.streams
+        else:
+            problems.append(f"{path}: is the record of another job")
+    except (ValueError, OSError) as error:
+        problems.append(files.wording(error))
+    if not (place / "clip.json").is_file():
+        return [*problems, f"{place / 'clip.json'}: missing"]
+    try:
+        clip = Clip.open(place)
+    except (ValueError, OSError) as error:
+        return [*problems, files.wording(error)]
+    if clip.info.job != expected.digest:
+        problems.append(f"{place / 'clip.json'}: is the clip of another job")
+    problems += clip.verify()
+    absent = [place / "streams" / f"{stream}.json" for stream in streams if stream not in clip.streams]
+    return problems + [f"{description}: missing" for description in absent]
+
+
+def unproven(folder: Path, job: Job) -> str | None:
+    """Return why a job that a worker reports as done is not done, or None.
+
+    Record and clip must be those of this job. Every file that they name must exist, and the codes must have the size
+    in their description. `verify_job` checks the contents.
+    """
+    path = record_path(folder, job.name)
+    place = folder / "clips" / job.name
+    try:
+        clip = Clip.open(place)
+        if read_record(path) != JobRecord.of(job) or clip.info.job != job.digest:
+            return f"{path}: is not the record of this job and its clip"
+        for name in clip.info.checksums:
+            if not (place / name).is_file() or (place / name).stat().st_size == 0:
+                return f"{place / name}: missing or empty"
+        for sensing in job.streams:
+            _ = clip.stream(sensing.stream_name).packed
+    except (ValueError, OSError) as error:
+        return files.wording(error)
+    return None

@@ -1,0 +1,75 @@
+"""Declares the keys of a recipe: the records of its sections, from which reader, listing and JSON Schema are made.
+
+    RecipeFile = Head [recipe] + ScenesSection [[scenes]] ... + StreamsSection [[streams]] ...
+
+The settings of a clip are those of `RenderSettings`, and the settings of a stream those of `Sensing`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from msgspec import Meta
+
+from qsim.kinds import Frames, Name, Seed, Speed, Split, Text
+from qsim.rendering.render_settings import RenderSettings
+from qsim.settings import section_of, setting
+from qsim.streams.sensing import Sensing
+
+Seeds = Seed | Annotated[tuple[Seed, ...], Meta(min_length=1)]
+Speeds = Speed | Annotated[tuple[Speed, ...], Meta(min_length=1)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeadKeys:
+    """The section [recipe]: name and seed of the data set, and the settings of all its clips."""
+
+    name: Annotated[Name, setting("of the data set: letters, digits, '.', '_', '-'")]
+    seed: Annotated[Seed | None, setting("of the samples and of the noise", unset="0")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenesKeys:
+    """A section [[scenes]]: one clip per seed and speed of a family."""
+
+    family: Annotated[Text, setting('a family of scenes/; or a .py, .xml, .glb file or folder beside it ("./things")')]
+    seeds: Annotated[Seeds | None, setting("one clip each; or give count")] = None
+    count: Annotated[Frames | None, setting("clips of the seeds first ... first + count - 1", unset="1")] = None
+    first: Annotated[Seed | None, setting("first seed of a count", unset="0")] = None
+    speed: Annotated[Speeds, setting("factor on all motions, a number or a list")] = 1.0
+    split: Annotated[Split, setting("split of the data set")] = "train"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamsKeys:
+    """A section [[streams]]: one stream per bits and light level, in every clip."""
+
+    absolute: Annotated[Literal[True] | None, setting("the light of the scene as it is, instead of ppp")] = None
+
+
+if TYPE_CHECKING:
+
+    class Head(HeadKeys, RenderSettings):
+        """The keys of [recipe]; settings that are not given are None."""
+
+    class ScenesSection(ScenesKeys, RenderSettings):
+        """The keys of [[scenes]]; settings that are not given are None."""
+
+    class StreamsSection(StreamsKeys, Sensing):
+        """The keys of [[streams]]; settings that are not given are None."""
+else:
+    Head = section_of("Head", RenderSettings, HeadKeys, needed=("frames", "height", "width"))
+    ScenesSection = section_of("ScenesSection", RenderSettings, ScenesKeys)
+    StreamsSection = section_of("StreamsSection", Sensing, StreamsKeys, needed=("sensor",))
+
+SECTIONS = {"[recipe]": Head, "[[scenes]]": ScenesSection, "[[streams]]": StreamsSection}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecipeFile:
+    """A recipe as it is written."""
+
+    recipe: Head
+    scenes: tuple[ScenesSection, ...] = ()
+    streams: tuple[StreamsSection, ...] = ()
