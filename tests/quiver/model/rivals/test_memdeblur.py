@@ -18,7 +18,7 @@ import pytest
 import torch
 from golden import DATA, arrays_of, beyond, draw, errors, golden_files, weights_by_table
 
-from quiver.model.rivals import memdeblur, memdeblur_memory
+from quiver.model.rivals import memdeblur
 from quiver.model.rivals.memdeblur import MemDeblur, MemDeblurConfig
 
 TABLE = DATA / "memdeblur_state_dict.tsv"
@@ -58,14 +58,14 @@ def test_weights_depend_on_the_prefix_and_few_frames_have_fewer_stages():
     assert (runs[0]["output_full"] - runs[1]["output_full"]).abs().max() > 0.01
 
 
-MISTAKES = {  # what is written, what is written wrongly; each in exactly one place of the two modules
+MISTAKES = {  # what is written, what is written wrongly; each in exactly one place of the module
     "LeakyReLU 0.2": ("SLOPE = 0.1", "SLOPE = 0.2"),
     "no ReLU in the residual block": ("x + self.conv2(F.relu(self.conv1(x)))", "x + self.conv2(self.conv1(x))"),
     "no square term": (" - keys.square().sum(dim=1)[..., None]", ""),
     "not divided by 8": ("nearness / math.sqrt(keys.shape[1])", "nearness"),
     "all entries": ("nearness.shape[1] > NEAREST", "nearness.shape[1] > 10**6"),
     "nothing dropped": ("kept = 0 if self.training else KEPT * new.keys.shape[2]", "kept = 0"),
-    "cleared between scales": ("memory, outputs = self.memory, []", "memory, outputs, stored = self.memory, [], None"),
+    "cleared between scales": ("        outputs = []\n", "        outputs = []\n        stored = None\n"),
     "backward memory of training": ("if self.training else i % BACKWARD_EVERY == 2", ""),
     "written at every frame": ("if i % EVERY[scale] == 0", "if True"),
     "value of the input image": ("self.downsampling(outputs[-1])", "self.downsampling(image)"),
@@ -85,8 +85,7 @@ MISTAKES = {  # what is written, what is written wrongly; each in exactly one pl
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_each_mistake_is_seen(mistake, monkeypatch):
     right, wrong = MISTAKES[mistake]
-    texts = [Path(module.__file__).read_text(encoding="utf-8") for module in (memdeblur_memory, memdeblur)]
-    source = "\n".join(texts).replace("from quiver.model.rivals.memdeblur_memory import", "# defined above:")
+    source = Path(memdeblur.__file__).read_text(encoding="utf-8")
     assert source.count(right) == 1
     module = types.ModuleType("mistaken")
     exec(source.replace(right, wrong), module.__dict__)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from golden import draw, fill_by_rule
 
-from quiver.model.rivals.memdeblur_memory import FEATURES, KEPT, NEAREST, Attention, Memory, Stored
+from quiver.model.rivals.memdeblur import FEATURES, KEPT, NEAREST, Attention, Memory, Stored
 
 
 def drawn(*shape: int) -> torch.Tensor:

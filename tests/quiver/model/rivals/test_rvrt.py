@@ -17,7 +17,7 @@ import torch
 from golden import DATA, arrays_of, beyond, compare, draw, errors, fill_by_rule, golden_files, weights_by_table
 
 from quiver.model.ops import deformable_attention
-from quiver.model.rivals import rvrt, rvrt_swin, spynet
+from quiver.model.rivals import rvrt, spynet
 from quiver.model.rivals.rvrt import RVRT, RVRTConfig, composed, reduced
 
 TABLE = DATA / "rvrt_state_dict.tsv"
@@ -53,12 +53,12 @@ MISTAKES = {  # module, what is written, what is written wrongly; each exactly o
     "flow the other way": (rvrt, "return self.spynet(first, second).unflatten(0, pairs), self.spynet(second, first)",
                            "return self.spynet(second, first).unflatten(0, pairs), self.spynet(first, second)"),
     "flow with zeros": (spynet, '"border"', '"zeros"'),
-    "another GELU": (rvrt_swin, "F.gelu(self.fc1(x))", 'F.gelu(self.fc1(x), approximate="tanh")'),
-    "no shift": (rvrt_swin, "SHIFT if self.shifted", "0 if self.shifted"),
-    "no mask": (rvrt_swin, "OTHER_REGION = -100.0", "OTHER_REGION = 0.0"),
-    "positions transposed": (rvrt_swin, "places[:, None] - places[None, :]", "places[None, :] - places[:, None]"),
-    "block without its skip": (rvrt_swin, "x + self.linear(shifted(", "self.linear(shifted("),
-    "no last normalisation": (rvrt_swin, 'self.main["7"](self.main["5"](self.main["3"](x)))',
+    "another GELU": (rvrt, "F.gelu(self.fc1(x))", 'F.gelu(self.fc1(x), approximate="tanh")'),
+    "no shift": (rvrt, "SHIFT if self.shifted", "0 if self.shifted"),
+    "no mask": (rvrt, "OTHER_REGION = -100.0", "OTHER_REGION = 0.0"),
+    "positions transposed": (rvrt, "places[:, None] - places[None, :]", "places[None, :] - places[:, None]"),
+    "block without its skip": (rvrt, "x + self.linear(shifted(", "self.linear(shifted("),
+    "no last normalisation": (rvrt, 'self.main["7"](self.main["5"](self.main["3"](x)))',
                               'self.main["5"](self.main["3"](x))'),
     "state first": (rvrt, "[*(feature[:, clip] for feature in features.values()), state]",
                     "[state, *(feature[:, clip] for feature in features.values())]"),
@@ -80,7 +80,6 @@ MISTAKES = {  # module, what is written, what is written wrongly; each exactly o
 }  # fmt: skip
 USES = {  # module: who uses its result, under which name
     rvrt: (golden_rvrt, "RVRT"),
-    rvrt_swin: (rvrt, "SwinStack"),
     spynet: (rvrt, "SpyNet"),
     deformable_attention: (rvrt, "deformable_attention"),
 }

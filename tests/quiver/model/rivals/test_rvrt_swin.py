@@ -4,7 +4,7 @@ import pytest
 import torch
 from golden import fill_by_rule
 
-from quiver.model.rivals.rvrt_swin import SwinLayer, SwinStack, relative_positions
+from quiver.model.rivals.rvrt import SwinLayer, SwinStack, relative_positions
 
 
 def reach(layer: torch.nn.Module, x: torch.Tensor, row: int, column: int) -> torch.Tensor:
