@@ -8,31 +8,6 @@
 Torch is imported with the first network or window, not with the package.
 """
 
-from __future__ import annotations
+from qsim.lazy_imports import attach
 
-from typing import TYPE_CHECKING
-
-from qsim.lazy_imports import lazy_names
-
-if TYPE_CHECKING:
-    from quiver.data.windows import windows
-    from quiver.evaluation.comparison import score_video as score
-    from quiver.model.published_weights import from_published
-    from quiver.model.quiver import QUIVER
-    from quiver.restoration.api import restore
-
-_HOMES = {
-    "QUIVER": "model.quiver",
-    "from_published": "model.published_weights",
-    "restore": "restoration.api",
-    "score": "evaluation.comparison:score_video",
-    "windows": "data.windows",
-}
-
-__all__ = ["QUIVER", "from_published", "restore", "score", "windows"]
-
-__getattr__ = lazy_names(__name__, _HOMES)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

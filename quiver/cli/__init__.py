@@ -1,17 +1,5 @@
 """Reads the command line of `quiver` and runs its commands."""
 
-from typing import TYPE_CHECKING
+from qsim.lazy_imports import attach
 
-from qsim.lazy_imports import lazy_names
-
-if TYPE_CHECKING:
-    from quiver.cli.program import main
-
-__all__ = ["main"]
-
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "main": "program",
-    },
-)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -102,10 +102,13 @@ def asked(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def homes() -> dict[str, dict[str, str]]:
-    """For every face: the module that each name comes from."""
-    return {
-        name_of(p): {name: module for module, name in asked(p) if name} for p in sources() if p.name == "__init__.py"
-    }
+    """For every face: the module that each name comes from, by its stub if it has one."""
+    found = {}
+    for path in sources():
+        if path.name == "__init__.py":
+            stub = path.with_suffix(".pyi")
+            found[name_of(path)] = {name: module for module, name in asked(stub if stub.exists() else path) if name}
+    return found
 
 
 def graph() -> dict[str, set[str]]:

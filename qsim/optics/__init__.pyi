@@ -1,0 +1,10 @@
+from .camera import Camera as Camera
+from .diffraction import diffract as diffract
+from .lens import Lens as Lens
+from .radiometry import RGB as RGB
+from .radiometry import WHITE_PER_MEAN as WHITE_PER_MEAN
+from .radiometry import LightLevel as LightLevel
+from .radiometry import band_photons as band_photons
+from .radiometry import expected_photons as expected_photons
+from .radiometry import photons_per_lux as photons_per_lux
+from .zoom import Zoom as Zoom

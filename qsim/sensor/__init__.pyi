@@ -1,0 +1,10 @@
+from .counting import CountingSPAD as CountingSPAD
+from .defects.pixel_array import PixelArray as PixelArray
+from .devices import load as load
+from .estimation import Response as Response
+from .packing import pack as pack
+from .packing import unpack as unpack
+from .qis import QIS as QIS
+from .sensor import Sensor as Sensor
+from .spad import BinarySPAD as BinarySPAD
+from .spike import SpikeCamera as SpikeCamera

@@ -1,0 +1,2 @@
+from .methods import METHODS as METHODS
+from .methods import Method as Method
