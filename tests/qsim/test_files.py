@@ -22,9 +22,7 @@ def test_force_writes_through_a_link(tmp_path: Path):
     job = recipe.parse(RECIPE).jobs[0]
     make(job, tmp_path / "disk2" / "far")
     (tmp_path / "near").symlink_to(tmp_path / "disk2" / "far")
-    meta = {
-        "shape": [1, 2, 3], "frame_rate": 1000.0, "exposure": 1e-3, "radiance_unit": "relative", "camera": None
-    }  # fmt: skip
+    meta = {"shape": [1, 2, 3], "frame_rate": 1000.0, "exposure": 1e-3, "radiance_unit": "relative", "camera": None}
     with ClipWriter(tmp_path / "near", meta, force=True) as writer:
         writer.add(0, np.ones((2, 3)))
     assert (tmp_path / "near").is_symlink()

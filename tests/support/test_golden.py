@@ -22,9 +22,14 @@ CHECKS = [  # name, shape, fill, first values, float64 sum (specification, secti
     ("memory.key_encoder.bn1.running_var", (64,), "one", [1.05713618, 0.882614374, 1.16749477], 63.814401),
     ("upsampling.0.weight", (64, 32, 3, 3), "fan0.8", [-0.0379223488, -0.0245238636, -0.0587641485], -8.52972102),
     ("d.convs.2.weight", (3, 128, 3, 3), "fan0.8", [0.0106919957, -0.0165313464, 0.00490278332], -1.73173221),
-    ("deform_align.backward_1.conv_offset.10.bias", (432,), "bias", [0.0277926605, -0.00392720802, -0.0361125432],
-     -0.240129179),
-]  # fmt: skip
+    (
+        "deform_align.backward_1.conv_offset.10.bias",
+        (432,),
+        "bias",
+        [0.0277926605, -0.00392720802, -0.0361125432],
+        -0.240129179,
+    ),
+]
 
 
 @pytest.mark.parametrize(("name", "shape", "fill", "first", "total"), CHECKS)
@@ -36,8 +41,13 @@ def test_the_rule_gives_the_stated_weights(name, shape, fill, first, total):
 
 def test_a_table_gives_every_entry_but_constants(tmp_path):
     table = tmp_path / "table.tsv"
-    rows = ["# name\tshape\tkind\tfill", "a.weight\t2x3\tparameter\tfan1.2", "b\tscalar\tbuffer\tzero",
-            "c\t4x4\tbuffer\tconst", "d.bias\t2\tparameter, unused\tbias"]  # fmt: skip
+    rows = [
+        "# name\tshape\tkind\tfill",
+        "a.weight\t2x3\tparameter\tfan1.2",
+        "b\tscalar\tbuffer\tzero",
+        "c\t4x4\tbuffer\tconst",
+        "d.bias\t2\tparameter, unused\tbias",
+    ]
     table.write_text("\n".join(rows) + "\n")
     found = weights_by_table(table)
     assert {name: tuple(value.shape) for name, value in found.items()} == {"a.weight": (2, 3), "b": (), "d.bias": (2,)}
@@ -152,8 +162,12 @@ def test_files_that_cannot_be_compared_are_one_line(tmp_path, capsys):
         "colour": good | {"codes": codes.repeat(4, axis=2)},
         "frames": good | {"codes": codes[:, :, 0]},
         "noise": good | {"noise_ab": np.ones(3)},
-        "no_flow": good | {"flow_forward": np.zeros((1, 3, 2, 8, 8)), "flow_backward": np.zeros((1, 1, 3, 8, 8)),
-                           "noise_map": np.zeros((1, 2, 1, 8, 8))},
+        "no_flow": good
+        | {
+            "flow_forward": np.zeros((1, 3, 2, 8, 8)),
+            "flow_backward": np.zeros((1, 1, 3, 8, 8)),
+            "noise_map": np.zeros((1, 2, 1, 8, 8)),
+        },
         "high": good | {"codes": codes + 8},
         "low": good | {"codes": codes - 1.0},
         "half": good | {"codes": codes + 0.5},
@@ -161,9 +175,13 @@ def test_files_that_cannot_be_compared_are_one_line(tmp_path, capsys):
         "one_pixel": good | {"codes": codes.repeat(16, axis=3).repeat(17, axis=4)},
         "odd": good | {"codes": codes[:, :1]},
         "emvd": good | {"codes": codes[..., :7], "noise_ab": np.ones(2)},
-        "flornn": good | {"flow_forward": np.zeros((1, 3, 2, 4, 4)), "flow_backward": np.zeros((1, 1, 2, 4, 4)),
-                          "noise_map": np.zeros((1, 2, 1, 8, 8))},
-    }  # fmt: skip
+        "flornn": good
+        | {
+            "flow_forward": np.zeros((1, 3, 2, 4, 4)),
+            "flow_backward": np.zeros((1, 1, 2, 4, 4)),
+            "noise_map": np.zeros((1, 2, 1, 8, 8)),
+        },
+    }
     for name, arrays in files.items():
         np.savez(tmp_path / f"{name}.npz", **arrays)
     cases = [
@@ -189,7 +207,7 @@ def test_files_that_cannot_be_compared_are_one_line(tmp_path, capsys):
         ("spk2imgnet", "emvd.npz", "t.tsv", "spk2imgnet takes frames whose sides 4 divides, got 8 x 7"),
         ("rvrt", "odd.npz", "t.tsv", "rvrt takes an even number of frames, got 1"),
         ("emvd", "emvd.npz", "t.tsv", "emvd takes frames whose sides 8 divides, got 8 x 7"),
-    ]  # fmt: skip
+    ]
     for network, file, rows, message in cases:
         assert main([network, str(tmp_path / file), str(tmp_path / rows)]) == 2
         shown = capsys.readouterr()

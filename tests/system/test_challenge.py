@@ -74,8 +74,9 @@ def test_from_the_recipe_to_a_submission(tmp_path):
 def test_rendered_scenes_in_the_layout(tmp_path):
     """Rendered fan and text: the restored picture of the last plane is nearer to the truth than one grey."""
     text = small(64, 40, 45)
-    (tmp_path / "small.toml").write_text(text[: text.index('[[scenes]]\nfamily = "room"')] + text[text.index(
-        '[[scenes]]\nfamily = "text"') :])  # fmt: skip
+    (tmp_path / "small.toml").write_text(
+        text[: text.index('[[scenes]]\nfamily = "room"')] + text[text.index('[[scenes]]\nfamily = "text"') :]
+    )
     assert main(["generate", str(tmp_path / "small.toml"), "-o", str(tmp_path / "data"), "--workers", "0"]) == 0
     found = to_submission(tmp_path, "qbp")
     (cube,) = cubes(tmp_path / "cubes" / "test")

@@ -68,8 +68,11 @@ def test_a_user_gets_types(tmp_path: Path):
     )
     found = subprocess.run(
         [sys.executable, "-m", "mypy", "--config-file", str(ROOT / "pyproject.toml"), str(program)],
-        capture_output=True, text=True, check=False, cwd=ROOT,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT,
+    )
     for words in ('"qsim.streams.clip.Clip"', '"qsim.streams.stream.Stream"', '"float"', '"ppp" to "sense"'):
         assert words in found.stdout, found.stdout
 

@@ -435,8 +435,10 @@ def _wheel(folder: Path, name: str, version: str, text: str) -> None:
     with zipfile.ZipFile(folder / f"{name}-{version}-py3-none-any.whl", "w") as file:
         about = f"{name}-{version}.dist-info"
         file.writestr(f"{name}.py", text)
-        file.writestr(f"{about}/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
-                      "Requires-Dist: a-package-of-no-index\n")  # fmt: skip
+        file.writestr(
+            f"{about}/METADATA",
+            f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\nRequires-Dist: a-package-of-no-index\n",
+        )
         file.writestr(f"{about}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
         file.writestr(f"{about}/RECORD", "")
 
@@ -523,11 +525,30 @@ def test_without_a_package_the_true_measurements_name_it(tmp_path, hidden, secti
 
 
 TINY = {
-    "height": 16, "width": 32, "sensor_pixels": 1 << 16, "rounds": 1, "families": ["fan"], "frames": 1, "psnr": 20.0,
-    "check_height": 16, "check_width": 24, "reference_samples": 256, "train_families": ["fan"], "train_psnr": 20.0,
-    "train_seeds": 1, "train_frames": 12, "train_height": 32, "train_width": 32, "crop": 32, "batch": 1, "steps": 2,
-    "copied_batches": 2, "restored": 2, "restored_slow": 2, "compared_side": 16,
-}  # fmt: skip
+    "height": 16,
+    "width": 32,
+    "sensor_pixels": 1 << 16,
+    "rounds": 1,
+    "families": ["fan"],
+    "frames": 1,
+    "psnr": 20.0,
+    "check_height": 16,
+    "check_width": 24,
+    "reference_samples": 256,
+    "train_families": ["fan"],
+    "train_psnr": 20.0,
+    "train_seeds": 1,
+    "train_frames": 12,
+    "train_height": 32,
+    "train_width": 32,
+    "crop": 32,
+    "batch": 1,
+    "steps": 2,
+    "copied_batches": 2,
+    "restored": 2,
+    "restored_slow": 2,
+    "compared_side": 16,
+}
 
 
 ABSENT = {  # without a GPU
@@ -546,8 +567,11 @@ def test_a_section_measures_on_this_machine_at_tiny_sizes(tmp_path, monkeypatch,
     out = tmp_path / "out"
     code = pieces.main([str(out), "--section", section, "--minutes", "60"], sizes=TINY)
     records = json.loads((out / "table.json").read_text())["records"][section]
-    told = {n: (r["why"], (out / "log" / f"{section}.{n}.txt").read_text(errors="replace")[-1500:])
-            for n, r in records.items() if r["state"] not in ("done", "absent")}  # fmt: skip
+    told = {
+        n: (r["why"], (out / "log" / f"{section}.{n}.txt").read_text(errors="replace")[-1500:])
+        for n, r in records.items()
+        if r["state"] not in ("done", "absent")
+    }
     assert code == 0, told
     assert not told
     absent = {name: record["why"] for name, record in records.items() if record["state"] == "absent"}

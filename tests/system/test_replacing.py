@@ -171,8 +171,10 @@ def test_a_clip_with_a_file_of_yours_is_not_replaced(tmp_path: Path, stranger: s
 @pytest.mark.filterwarnings("ignore:.*validating on training clips")
 def test_training_and_evaluation_replace_only_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     write_clip(tmp_path / "clip", frames=14, height=36, width=44)
-    for command, mark in ((f"train {tmp_path / 'clip'} --steps 1 --crop 32", "settings.json"),
-                          (f"evaluate {tmp_path / 'clip'} --methods naive --ppp 1", "plan.json")):  # fmt: skip
+    for command, mark in (
+        (f"train {tmp_path / 'clip'} --steps 1 --crop 32", "settings.json"),
+        (f"evaluate {tmp_path / 'clip'} --methods naive --ppp 1", "plan.json"),
+    ):
         folder = tmp_path / mark.removesuffix(".json")
         folder.mkdir()
         (folder / mark).write_text("{}")
@@ -185,8 +187,18 @@ def test_training_and_evaluation_replace_only_their_own(tmp_path: Path, capsys: 
 def test_an_import_replaces_only_a_stream(tmp_path: Path):
     np.save(tmp_path / "codes.npy", np.zeros((2, 6, 8), np.uint8))
     np.save(tmp_path / "mine.npy", np.ones(3))
-    line = ["convert", str(tmp_path / "codes.npy"), str(tmp_path / "mine"), "--layout", "codes", "--bits", "3",
-            "--frame-rate", "9", "--force"]  # fmt: skip
+    line = [
+        "convert",
+        str(tmp_path / "codes.npy"),
+        str(tmp_path / "mine"),
+        "--layout",
+        "codes",
+        "--bits",
+        "3",
+        "--frame-rate",
+        "9",
+        "--force",
+    ]
     for described in (None, {"frame_rate": 9}):
         if described is not None:
             (tmp_path / "mine.json").write_text(json.dumps(described))

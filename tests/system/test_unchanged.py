@@ -214,9 +214,17 @@ def laws_of_sensors(folder: Path) -> Results:
 # Streams
 
 DEVICES = (
-    "quiver-physical", "quiver-paper", "quiver-published", "cmos-5.1e", "spad-320x240", "qis-ma2017", "megax-a",
-    "megax-b", "spad512s", "spcm20a",
-)  # fmt: skip
+    "quiver-physical",
+    "quiver-paper",
+    "quiver-published",
+    "cmos-5.1e",
+    "spad-320x240",
+    "qis-ma2017",
+    "megax-a",
+    "megax-b",
+    "spad512s",
+    "spcm20a",
+)
 DEFECTS = {
     "qis": "device_seed = 7\nprnu = 0.05\ndead = 0.02\noffset = 0.2\nread_noise = 0.1\n"
     "dark = { spread = 0.18, hot_share = 0.1, hot_from = 3.0, hot_to = 400.0, tail = 0.67 }",

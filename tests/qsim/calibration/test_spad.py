@@ -125,8 +125,14 @@ def test_sums_are_calibrated_exactly_as_their_planes(seed):
         sums = bits.reshape(frames, planes, H, W).sum(axis=1)
         kind = rng.choice([np.uint16, np.float64, np.int64])
         one = measure([bits], bits=1, exposure=exposure, photons=photons)
-        stacks.append((one, measure_sums([sums[:1].astype(kind), sums[1:].astype(kind)], planes=planes,
-                                         exposure=exposure, photons=photons)))  # fmt: skip
+        stacks.append(
+            (
+                one,
+                measure_sums(
+                    [sums[:1].astype(kind), sums[1:].astype(kind)], planes=planes, exposure=exposure, photons=photons
+                ),
+            )
+        )
     for one, many in stacks:
         assert np.array_equal(one.total, many.total)
         assert np.array_equal(one.square, many.square)

@@ -330,10 +330,13 @@ def test_an_answer_for_a_job_that_nobody_asked_for(tmp_path: Path):
 def test_a_job_is_retried_after_its_cause_was_removed_from_the_recipe(tmp_path: Path):
     """The digest of a clip that was never made refused the recipe without the cause."""
     folder = tmp_path / "d"
-    slower = replace(SMALL, jobs=tuple(
-        replace(job, settings=replace(job.settings, psnr=39.0)) if job.name == "tumble_0004" else job
-        for job in SMALL.jobs
-    ))  # fmt: skip
+    slower = replace(
+        SMALL,
+        jobs=tuple(
+            replace(job, settings=replace(job.settings, psnr=39.0)) if job.name == "tumble_0004" else job
+            for job in SMALL.jobs
+        ),
+    )
     first = generate(SMALL, folder, HERE, make=fail_on_tumble)
     assert list(first.failed) == ["tumble_0004"]
     assert generate(slower, folder, HERE, make=make) == Summary(3, 3, 1, {}, ())

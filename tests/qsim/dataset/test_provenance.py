@@ -7,9 +7,17 @@ from qsim.scene import Body, Diffuse, textures
 
 
 def test_assets_of_a_scene():
-    described = {"kind": "Scene", "bodies": [{"kind": "Body", "mesh": {"kind": "Mesh", "vertices": {"sha256": "m"}},
-                 "material": {"kind": "Diffuse", "reflectance": {"kind": "Texture", "image": {"sha256": "t"}}}}],
-                 "lights": [{"kind": "EnvironmentImage", "image": "sky.hdr"}]}  # fmt: skip
+    described = {
+        "kind": "Scene",
+        "bodies": [
+            {
+                "kind": "Body",
+                "mesh": {"kind": "Mesh", "vertices": {"sha256": "m"}},
+                "material": {"kind": "Diffuse", "reflectance": {"kind": "Texture", "image": {"sha256": "t"}}},
+            }
+        ],
+        "lights": [{"kind": "EnvironmentImage", "image": "sky.hdr"}],
+    }
     assert provenance.assets(described) == ["mesh m", "texture sky.hdr", "texture t"]
 
 

@@ -148,7 +148,7 @@ MISTAKES = [
     ('split = "test"', f'split = "val"\n{AGAIN}"tumble"\nfirst = 5\nspeed = 2', r"scenes\[2\]: .*splits 'val' and"),
     ("ppp = [0.5, 3.25]", f"ppp = 3.25\n{STREAMS}", r"streams\[1\]: two \[\[streams"),
     ("[[streams]]", "[[stream]]", r"unknown key 'stream' \(did you mean 'streams'\?\)"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("old", "new", "message"), MISTAKES, ids=[m[1].replace("\n", " ") for m in MISTAKES])

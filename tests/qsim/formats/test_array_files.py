@@ -30,10 +30,11 @@ def test_golden_photon_cube(tmp_path: Path):
 @settings(max_examples=150, deadline=None)
 @given(
     codes=st.integers(1, 70).flatmap(
-        lambda width: hnp.arrays(np.uint8, st.tuples(st.integers(1, 4), st.integers(1, 9), st.just(width)),
-                                 elements=st.integers(0, 1))
+        lambda width: hnp.arrays(
+            np.uint8, st.tuples(st.integers(1, 4), st.integers(1, 9), st.just(width)), elements=st.integers(0, 1)
+        )
     )
-)  # fmt: skip
+)
 def test_photon_cubes_of_every_width(tmp_path_factory: pytest.TempPathFactory, codes: np.ndarray):
     path = tmp_path_factory.getbasetemp() / "cube.npy"
     array_files.write_cube(path, iter([codes]), codes.shape)

@@ -96,8 +96,14 @@ def test_a_stack_behind_a_single_page_is_refused(tmp_path: Path, imagej: bool):
 
     frames = np.random.default_rng(0).integers(0, 256, (5, 9, 7)).astype(np.uint8)
     for truncate in (False, True):
-        tifffile.imwrite(tmp_path / "a.tif", frames, imagej=imagej, truncate=truncate, photometric="minisblack",
-                         metadata={"axes": "TYX"})  # fmt: skip
+        tifffile.imwrite(
+            tmp_path / "a.tif",
+            frames,
+            imagej=imagej,
+            truncate=truncate,
+            photometric="minisblack",
+            metadata={"axes": "TYX"},
+        )
         if truncate:
             with pytest.raises(ValueError, match=r"a\.tif: holds more frames than the 1 that its pages describe"):
                 importing.read(tmp_path / "a.tif", Hints(bits=8))
@@ -217,8 +223,17 @@ def test_tiff_that_needs_a_decoder_names_its_package(tmp_path: Path, monkeypatch
 
     pixels = np.array([[0x123, 0xABC], [0xFFF, 0x000]])
     content = bytes([0x12, 0x3A, 0xBC, 0xFF, 0xF0, 0x00])
-    tags = [(256, 3, 1, 2), (257, 3, 1, 2), (258, 3, 1, 12), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, 8),
-            (277, 3, 1, 1), (278, 3, 1, 2), (279, 4, 1, 6)]  # fmt: skip
+    tags = [
+        (256, 3, 1, 2),
+        (257, 3, 1, 2),
+        (258, 3, 1, 12),
+        (259, 3, 1, 1),
+        (262, 3, 1, 1),
+        (273, 4, 1, 8),
+        (277, 3, 1, 1),
+        (278, 3, 1, 2),
+        (279, 4, 1, 6),
+    ]
     table = b"".join(struct.pack("<HHII", *tag) for tag in tags)
     head = struct.pack("<2sHI", b"II", 42, 14) + content
     (tmp_path / "a.tif").write_bytes(head + struct.pack("<H", len(tags)) + table + bytes(4))

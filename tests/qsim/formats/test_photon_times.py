@@ -201,10 +201,15 @@ def test_damaged_files_are_refused_in_one_line(tmp_path):
             np.savez(packed, **(arrays | {"meta": text}))
             assert refused(packed.getvalue()), (key, value)
     for name, array in (
-        ("times", arrays["times"][::-1]), ("times", arrays["times"] + 1), ("times", arrays["times"] * np.nan),
-        ("kind", arrays["kind"] + np.uint8(8)), ("kind", arrays["kind"][1:]), ("first", arrays["first"][:-1]),
-        ("first", arrays["first"] + 1), ("times", arrays["times"].astype(np.float32)),
-    ):  # fmt: skip
+        ("times", arrays["times"][::-1]),
+        ("times", arrays["times"] + 1),
+        ("times", arrays["times"] * np.nan),
+        ("kind", arrays["kind"] + np.uint8(8)),
+        ("kind", arrays["kind"][1:]),
+        ("first", arrays["first"][:-1]),
+        ("first", arrays["first"] + 1),
+        ("times", arrays["times"].astype(np.float32)),
+    ):
         packed = io.BytesIO()
         np.savez(packed, **(arrays | {name: array}))
         assert refused(packed.getvalue()), name

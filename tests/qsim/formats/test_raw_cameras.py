@@ -25,9 +25,16 @@ def test_golden_spike():
 
 @pytest.mark.parametrize(
     ("y", "x", "byte", "value"),
-    [(0, 0, 0, 1), (0, 127, 15, 0x80), (0, 128, 32, 1), (255, 0, 32640, 1), (256, 0, 32656, 1), (511, 0, 16, 1),
-     (511, 511, 127, 0x80)],
-)  # fmt: skip
+    [
+        (0, 0, 0, 1),
+        (0, 127, 15, 0x80),
+        (0, 128, 32, 1),
+        (255, 0, 32640, 1),
+        (256, 0, 32656, 1),
+        (511, 0, 16, 1),
+        (511, 511, 127, 0x80),
+    ],
+)
 def test_golden_swissspad2_full(tmp_path: Path, y: int, x: int, byte: int, value: int):
     raw = bytearray(32768)
     raw[byte] = value
@@ -106,9 +113,13 @@ def test_spikes_are_written_as_others_write_them(
 
 @pytest.mark.parametrize(
     ("layout", "size", "row"),
-    [("swissspad2-half", (256, 512), 0), ("swissspad2-full", (512, 512), 0), ("spad512s", (512, 512), 0),
-     ("spike", (6, 8), 5)],
-)  # fmt: skip
+    [
+        ("swissspad2-half", (256, 512), 0),
+        ("swissspad2-full", (512, 512), 0),
+        ("spad512s", (512, 512), 0),
+        ("spike", (6, 8), 5),
+    ],
+)
 def test_the_bit_order_of_raw_files_is_said_as_it_is_read(tmp_path: Path, layout: str, size: tuple[int, int], row: int):
     """The first bit in the said order is the left pixel of the top row, or of the bottom row if it says upside down."""
     raw = np.zeros(size[0] * size[1] // 8, np.uint8)

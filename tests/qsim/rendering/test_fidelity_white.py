@@ -96,8 +96,16 @@ def test_a_rendered_clip_states_its_error_below_its_own_white(tmp_path, capsys):
     assert clip.info.white == pytest.approx(white_in(radiance), rel=1e-3)
     assert clip.info.render.white == pytest.approx(clip.info.white, rel=0.5)
     assert clip.info.psnr_of_truth >= clip.info.psnr_unclamped
-    for words in ("20 dB below white", "of the pixels are brighter", "clamped there, as in scores", "without a clamp",
-                  "% of the pixels move", "mean light", "the bounces left out", stated(clip.info).line):  # fmt: skip
+    for words in (
+        "20 dB below white",
+        "of the pixels are brighter",
+        "clamped there, as in scores",
+        "without a clamp",
+        "% of the pixels move",
+        "mean light",
+        "the bounces left out",
+        stated(clip.info).line,
+    ):
         assert words in text, words
 
 

@@ -76,9 +76,12 @@ def test_no_expectation_is_shown_without_an_exact_one(tmp_path):
 def test_the_section_states_light_motion_model_and_error(tmp_path):
     """Numbers of the page are those of the clip: photons, factor, lux, motion, findings, error of every frame."""
     clip = write_clip(
-        tmp_path / "lit", frames=4, height=20, width=24,
+        tmp_path / "lit",
+        frames=4,
+        height=20,
+        width=24,
         render={"findings": [{"effect": "bounces", "chosen": "2", "size": "later ones <1 %"}]},
-    )  # fmt: skip
+    )
     assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3"]) == 0
     stream = clip.stream(clip.streams[0])
     page = report.build_page(clip.path)

@@ -19,7 +19,7 @@ from qsim.report.html import (
     stored_figure,
     strip,
     table,
-)  # fmt: skip
+)
 
 
 def frames(t: int = 3, h: int = 5, w: int = 7) -> np.ndarray:
@@ -84,9 +84,16 @@ def test_columns_of_formatted_numbers_are_aligned_too():
 
 @pytest.mark.parametrize(
     ("value", "shown"),
-    [(6.502e-5, "6.502e-05"), (0.00065, "0.00065"), (0.35681, "0.3568"), (12.0, "12"), (1428.57, "1429"),
-     (123456.7, "123457"), (0.0, "0")],
-)  # fmt: skip
+    [
+        (6.502e-5, "6.502e-05"),
+        (0.00065, "0.00065"),
+        (0.35681, "0.3568"),
+        (12.0, "12"),
+        (1428.57, "1429"),
+        (123456.7, "123457"),
+        (0.0, "0"),
+    ],
+)
 def test_numbers_have_four_digits(value, shown):
     assert number_text(value) == shown
 

@@ -102,8 +102,10 @@ CROSSED_OF = [{c: CROSSED[c] for c in sorted(set("".join(MASKS[name])))} for nam
 
 def test_tables_are_read_as_they_are_written(tmp_path):
     path = tmp_path / "mine.toml"
-    path.write_text('[colour]\nmask = ["RG", "WB"]\nefficiency.R = 0.5\nefficiency.G = [0.1, 0.6, 0.1]\n'
-                    "efficiency.B = 0.4\nefficiency.W = [0.7, 0.7, 0.6]\n")  # fmt: skip
+    path.write_text(
+        '[colour]\nmask = ["RG", "WB"]\nefficiency.R = 0.5\nefficiency.G = [0.1, 0.6, 0.1]\n'
+        "efficiency.B = 0.4\nefficiency.W = [0.7, 0.7, 0.6]\n"
+    )
     found = colour_filter.load(path)
     assert found.mask == ("RG", "WB")
     assert found.efficiency == {"R": (0.5, 0, 0), "G": (0.1, 0.6, 0.1), "B": (0, 0, 0.4), "W": (0.7, 0.7, 0.6)}

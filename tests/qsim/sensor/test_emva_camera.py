@@ -30,10 +30,24 @@ def test_mean_and_variance_are_those_of_the_standards_camera(photons, wanted_gai
 
     efficiency = routines.Qe(qe=np.full((SIDE, SIDE, 1), EFFICIENCY), wavelength=WAVELENGTH, width=SIDE, height=SIDE)
     camera = emva1288.Camera(
-        f_number=F_NUMBER, pixel_area=PITCH**2, bit_depth=12, width=SIDE, height=SIDE, qe=efficiency,
-        exposure=EXPOSURE * 1e9, K=wanted_gain, K_min=wanted_gain, K_max=wanted_gain, K_steps=1, blackoffset=0,
-        dark_current_ref=0.0, dark_signal_0=OFFSET, sigma2_dark_0=READ_NOISE**2, u_esat=1e9, seed=1,
-    )  # fmt: skip
+        f_number=F_NUMBER,
+        pixel_area=PITCH**2,
+        bit_depth=12,
+        width=SIDE,
+        height=SIDE,
+        qe=efficiency,
+        exposure=EXPOSURE * 1e9,
+        K=wanted_gain,
+        K_min=wanted_gain,
+        K_max=wanted_gain,
+        K_steps=1,
+        blackoffset=0,
+        dark_current_ref=0.0,
+        dark_signal_0=OFFSET,
+        sigma2_dark_0=READ_NOISE**2,
+        u_esat=1e9,
+        seed=1,
+    )
     light = routines.get_radiance(camera.exposure, photons, camera.pixel_area, F_NUMBER, WAVELENGTH)
     codes = np.stack([camera.grab(light) for _ in range(FRAMES)]).astype(np.float64)
 

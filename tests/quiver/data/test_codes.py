@@ -105,8 +105,9 @@ def test_the_estimated_light_holds_no_noise(sensor, frames):
     found = light_of(array_codes(codes, sensor, EXPOSURE))
     table = sensor.response(EXPOSURE)
     read = min(frames, 11)
-    slope, variance = (np.interp(light[0], table.photons, x) for x in (np.gradient(table.photons, table.mean),
-                                                                      table.variance))  # fmt: skip
+    slope, variance = (
+        np.interp(light[0], table.photons, x) for x in (np.gradient(table.photons, table.mean), table.variance)
+    )
     sigma = np.sqrt((slope**2 * variance).sum() / read) / light[0].size
     assert found == pytest.approx(0.5, abs=5 * sigma + 0.02 * 0.5)  # 2 %: few codes and a bent response
 

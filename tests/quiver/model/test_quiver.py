@@ -25,10 +25,17 @@ def test_the_parts_have_the_published_sizes():
     with torch.device("meta"):
         parts = {name: sum(p.numel() for p in part.parameters()) for name, part in QUIVER(64).named_children()}
     assert parts == {
-        "denoiser": 332_929, "flow": 935_112, "noisy_features": 24_192, "denoised_features": 24_192,
-        "alignment": 434_992, "fusions": 3 * 41_280, "cell": 27_951_904, "attention": 103_834_368,
-        "refine4": 11_546_891, "refine": 11_546_891,
-    }  # fmt: skip
+        "denoiser": 332_929,
+        "flow": 935_112,
+        "noisy_features": 24_192,
+        "denoised_features": 24_192,
+        "alignment": 434_992,
+        "fusions": 3 * 41_280,
+        "cell": 27_951_904,
+        "attention": 103_834_368,
+        "refine4": 11_546_891,
+        "refine": 11_546_891,
+    }
 
 
 def test_wrong_names_and_settings_say_what_is_right():

@@ -84,7 +84,7 @@ def test_shipped_weights_decide_by_what_was_measured(ppp):
         "bench -o b --methods auto --size 16x16",
     ],
 )
-def test_other_commands_say_what_auto_is_for(capsys, tiny_dataset, tmp_path, monkeypatch, command):  # fmt: skip
+def test_other_commands_say_what_auto_is_for(capsys, tiny_dataset, tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     np.save("c.npy", np.zeros((3, 16, 16), np.uint8))
     assert main(command.replace("D", str(tiny_dataset)).split()) == 2

@@ -203,8 +203,12 @@ def test_a_frame_that_fits_takes_no_more_than_stated(preset, mode, side):
 def test_a_network_has_a_title():
     config = Config(channels=32)
     titles = {name: network_title(build(name)) for name in ("mergenet", "quiver-s", "unet", "emvd")}
-    assert titles == {"mergenet": "MergeNet (mergenet)", "quiver-s": "QUIVER (quiver-s)", "unet": "U-Net",
-                      "emvd": "EMVD (emvd)"}  # fmt: skip
+    assert titles == {
+        "mergenet": "MergeNet (mergenet)",
+        "quiver-s": "QUIVER (quiver-s)",
+        "unet": "U-Net",
+        "emvd": "EMVD (emvd)",
+    }
     assert network_title(QUIVER(config)) == "QUIVER"
 
 

@@ -385,8 +385,10 @@ REFUSED = {
     "loop of lines": (lambda file: primitive(file).update(mode=2), r"not made of triangles \(mode 4\)"),
     "index 14": (lambda file: primitive(file).update(indices=file.add([0, 1, 14], "u2")), "of its 14 vertices"),
     "two indices": (lambda file: primitive(file).update(indices=file.add([0, 1], "u2")), "three indices each"),
-    "bind matrices": (lambda file: file.content["skins"][0].update(inverseBindMatrices=file.add(np.zeros((1, 16)))),
-                      r"skins\[0\] needs 2 of MAT4, but"),
+    "bind matrices": (
+        lambda file: file.content["skins"][0].update(inverseBindMatrices=file.add(np.zeros((1, 16)))),
+        r"skins\[0\] needs 2 of MAT4, but",
+    ),
     "bind of a lens": (
         lambda file: file.content["skins"][0].update(inverseBindMatrices=file.add(np.ones((2, 16)))),
         r"skins\[0\]: the last row of its matrix is \[1.0, 1.0, 1.0, 1.0\], not 0, 0, 0, 1",
@@ -406,8 +408,10 @@ REFUSED = {
     "times before 0": (lambda file: sampler(file).update(input=file.add([-1.0, 1.0])), "its first key is at -1 s"),
     "spline of two": (lambda file: sampler(file).update(interpolation="CUBICSPLINE"), "needs 6 of VEC4, but"),
     "interpolation": (lambda file: sampler(file).update(interpolation="CURVE"), "expected one of STEP, LINEAR"),
-    "twice": (lambda file: file.content["animations"][0].update(channels=2 * file.content["animations"][0]["channels"]),
-              r"the rotation of nodes\[1\] has two channels"),
+    "twice": (
+        lambda file: file.content["animations"][0].update(channels=2 * file.content["animations"][0]["channels"]),
+        r"the rotation of nodes\[1\] has two channels",
+    ),
     "keys of a matrix": (put("nodes.1", {"matrix": np.eye(4).ravel().tolist()}), r"nodes\[1\], which has a matrix"),
     "no targets": (put("animations.0.channels.0.target.path", "weights"), r"nodes\[1\], which has no morph targets"),
     "node 7": (put("animations.0.channels.0.target.node", 7), "its node 7 or its sampler 0 does not exist"),
@@ -420,7 +424,7 @@ REFUSED = {
     "component": (put("accessors.0.componentType", 5124), r"accessors\[0\]: componentType: expected one of 5120"),
     "key missing": (lambda file: file.content["accessors"][0].pop("count"), r"accessors\[0\]: key 'count' is missing"),
     "a text for a list": (put("nodes", "many"), "nodes: expected a list, got a str"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", REFUSED)

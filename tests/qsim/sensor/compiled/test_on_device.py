@@ -21,8 +21,12 @@ def test_codes_equal_the_reference_for_random_sensors_sizes_and_crops():
         origin = tuple(rng.integers(0, 9, 2).tolist())
         key = Key(int(rng.integers(100)), 5, int(rng.integers(50)))
         photons = light(SENSORS[name], shape, seed=int(rng.integers(100)))
-        expected = np.stack([SENSORS[name].sample(frame, EXPOSURE, key=key.at(key.frame + t), origin=origin,
-                                                  engine="reference") for t, frame in enumerate(photons)])  # fmt: skip
+        expected = np.stack(
+            [
+                SENSORS[name].sample(frame, EXPOSURE, key=key.at(key.frame + t), origin=origin, engine="reference")
+                for t, frame in enumerate(photons)
+            ]
+        )
         np.testing.assert_array_equal(drawn(SENSORS[name], photons, origin, key), expected, strict=True)
 
 

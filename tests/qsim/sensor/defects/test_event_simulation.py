@@ -309,8 +309,15 @@ def test_following_photons_tells_each_row():
     array = PixelArray.of(Defects(), sensor, 5, 4)
     light = np.random.default_rng(0).uniform(0, 20, (3, 1, 5, 4))
     told: list[tuple[int, int]] = []
-    whole = follow(array, lambda t, y, n: light[t, :, y : y + n], (3, 5, 4), 1e-3, 2e-3, Key(seed=1, clip=2),
-                   progress=lambda *done: told.append(done))  # fmt: skip
+    whole = follow(
+        array,
+        lambda t, y, n: light[t, :, y : y + n],
+        (3, 5, 4),
+        1e-3,
+        2e-3,
+        Key(seed=1, clip=2),
+        progress=lambda *done: told.append(done),
+    )
     assert told == [(y, 5) for y in range(1, 6)]
     rest = PixelArray.of(Defects(), sensor, 3, 4, (2, 0))
     below = follow(

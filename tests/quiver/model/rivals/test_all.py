@@ -119,9 +119,14 @@ def test_the_noise_of_a_sensor_reaches_the_networks_that_take_it(name):
 
 
 @pytest.mark.parametrize(
-    "frames", [torch.zeros(3, 1, 8, 8), torch.zeros(1, 3, 2, 8, 8), torch.zeros(1, 0, 1, 8, 8),
-               torch.zeros(1, 3, 1, 8, 8, dtype=torch.uint8)]
-)  # fmt: skip
+    "frames",
+    [
+        torch.zeros(3, 1, 8, 8),
+        torch.zeros(1, 3, 2, 8, 8),
+        torch.zeros(1, 0, 1, 8, 8),
+        torch.zeros(1, 3, 1, 8, 8, dtype=torch.uint8),
+    ],
+)
 def test_other_shapes_and_integers_are_refused(network, frames):
     with pytest.raises(ValueError, match=r"^frames must be floating-point numbers \[B, T, 1, H, W\], got .*; give .*$"):
         network(frames)

@@ -55,11 +55,15 @@ def test_weights_depend_on_the_prefix_and_few_frames_have_fewer_stages():
 
 
 MISTAKES = {  # what is written, what is written wrongly; each exactly once in the module
-    "high row with the other sign": ('taps = self.net1["weight"].view(2, 2)',
-                                     'taps = self.net1["weight"].view(2, 2) * torch.tensor([[1], [-1]])'),
+    "high row with the other sign": (
+        'taps = self.net1["weight"].view(2, 2)',
+        'taps = self.net1["weight"].view(2, 2) * torch.tensor([[1], [-1]])',
+    ),
     "blocks exchanged": ("for h in halves for low, high in taps", "for low, high in taps for h in halves"),
-    "inverse taps transposed": ("low * low_taps[k] + high * high_taps[k]",
-                                "low * (low_taps, high_taps)[k][0] + high * (low_taps, high_taps)[k][1]"),
+    "inverse taps transposed": (
+        "low * low_taps[k] + high * high_taps[k]",
+        "low * (low_taps, high_taps)[k][0] + high * (low_taps, high_taps)[k][1]",
+    ),
     "no absolute value": ("(new_low - old_low).abs()", "(new_low - old_low)"),
     "order of noise and gamma": ("*coarser, new_noise]", "new_noise, *coarser]"),
     "order of the denoiser": ("[fused, *images, new_low, variance]", "[fused, new_low, *images, variance]"),
@@ -67,12 +71,16 @@ MISTAKES = {  # what is written, what is written wrongly; each exactly once in t
     "not clipped": ("brightness.clamp(0, 1) * self.slope", "brightness * self.slope"),
     "gamma the other way": ("fused = torch.lerp(old, new, gamma)", "fused = torch.lerp(new, old, gamma)"),
     "gamma not squared": ("+ gamma**2 * new_noise", "+ gamma * new_noise"),
-    "omega the other way": ("torch.lerp(result.denoised, result.fused, omega)",
-                            "torch.lerp(result.fused, result.denoised, omega)"),
+    "omega the other way": (
+        "torch.lerp(result.denoised, result.fused, omega)",
+        "torch.lerp(result.fused, result.denoised, omega)",
+    ),
     "state is the output": ("self.cti(self.fti(result.fused))", "self.cti(self.fti(refined))"),
-    "ReLU at the end": ("x = self.net3(F.relu(self.net2(F.relu(self.net1(x)))))",
-                        "x = F.relu(self.net3(F.relu(self.net2(F.relu(self.net1(x))))))"),
-}  # fmt: skip
+    "ReLU at the end": (
+        "x = self.net3(F.relu(self.net2(F.relu(self.net1(x)))))",
+        "x = F.relu(self.net3(F.relu(self.net2(F.relu(self.net1(x))))))",
+    ),
+}
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

@@ -71,14 +71,16 @@ MISTAKES = {  # what is written, what is written wrongly; each in exactly one pl
     "value of the input image": ("self.downsampling(outputs[-1])", "self.downsampling(image)"),
     "coarser features too early": ("parts.append(self.downsampling(", "parts.insert(1, self.downsampling("),
     "reads exchanged": ("of_features, of_images =", "of_images, of_features ="),
-    "fusion the other way": ("join(resize(behind[i], *feature.shape[-2:]), hidden)",
-                             "join(hidden, resize(behind[i], *feature.shape[-2:]))"),
+    "fusion the other way": (
+        "join(resize(behind[i], *feature.shape[-2:]), hidden)",
+        "join(hidden, resize(behind[i], *feature.shape[-2:]))",
+    ),
     "sizes rounded down": ("-(side // divisor) // MULTIPLE * -MULTIPLE", "side // divisor // MULTIPLE * MULTIPLE"),
     "no bilinear skip": (" + resize(y, 4 * y.shape[-2], 4 * y.shape[-1])", ""),
     "eps 1e-3": ("nn.BatchNorm2d(channels)", "nn.BatchNorm2d(channels, eps=1e-3)"),
     "decoder of images for features": ("return self.decoder_feat(values)", "return self.decoder_mem(values)"),
     "values image first": ("join(feature_value, image_value)", "join(image_value, feature_value)"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.slow

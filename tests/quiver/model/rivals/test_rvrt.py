@@ -50,34 +50,54 @@ def test_two_clips_of_another_size_equal_the_published_numbers():
 
 MISTAKES = {  # module, what is written, what is written wrongly; each exactly once in the module
     "area mean": (rvrt, "(-3 / 32, 19 / 32, 19 / 32, -3 / 32)", "(1 / 4, 1 / 4, 1 / 4, 1 / 4)"),
-    "flow the other way": (rvrt, "return self.spynet(first, second).unflatten(0, pairs), self.spynet(second, first)",
-                           "return self.spynet(second, first).unflatten(0, pairs), self.spynet(first, second)"),
+    "flow the other way": (
+        rvrt,
+        "return self.spynet(first, second).unflatten(0, pairs), self.spynet(second, first)",
+        "return self.spynet(second, first).unflatten(0, pairs), self.spynet(first, second)",
+    ),
     "flow with zeros": (spynet, '"border"', '"zeros"'),
     "another GELU": (rvrt, "F.gelu(self.fc1(x))", 'F.gelu(self.fc1(x), approximate="tanh")'),
     "no shift": (rvrt, "SHIFT if self.shifted", "0 if self.shifted"),
     "no mask": (rvrt, "OTHER_REGION = -100.0", "OTHER_REGION = 0.0"),
     "positions transposed": (rvrt, "places[:, None] - places[None, :]", "places[None, :] - places[:, None]"),
     "block without its skip": (rvrt, "x + self.linear(shifted(", "self.linear(shifted("),
-    "no last normalisation": (rvrt, 'self.main["7"](self.main["5"](self.main["3"](x)))',
-                              'self.main["5"](self.main["3"](x))'),
-    "state first": (rvrt, "[*(feature[:, clip] for feature in features.values()), state]",
-                    "[state, *(feature[:, clip] for feature in features.values())]"),
+    "no last normalisation": (
+        rvrt,
+        'self.main["7"](self.main["5"](self.main["3"](x)))',
+        'self.main["5"](self.main["3"](x))',
+    ),
+    "state first": (
+        rvrt,
+        "[*(feature[:, clip] for feature in features.values()), state]",
+        "[state, *(feature[:, clip] for feature in features.values())]",
+    ),
     "always the shallow features": (rvrt, "last = features[list(features)[-1]]", 'last = features["shallow"]'),
     "crossed frames not crossed": (rvrt, "(value.flip(1), guides.crossed)", "(value, guides.crossed)"),
-    "sources not crossed": (rvrt, "torch.stack([x, x.flip(1)], dim=2)", "torch.stack([x[:, :1], x[:, 1:]], dim=2)"
-                            ".expand(-1, 2, -1, -1, -1, -1)"),
+    "sources not crossed": (
+        rvrt,
+        "torch.stack([x, x.flip(1)], dim=2)",
+        "torch.stack([x[:, :1], x[:, 1:]], dim=2).expand(-1, 2, -1, -1, -1, -1)",
+    ),
     "flow unflipped": (rvrt, "+ flows.flip(3)[", "+ flows["),
-    "keys at the places of values": (deformable_attention, "return torch.cat([_attend(",
-                                     "y, x = (p[:, :, : p.shape[2] // 2].repeat(1, 1, 2, 1, 1, 1) for p in (y, x))\n"
-                                     "        return torch.cat([_attend("),
+    "keys at the places of values": (
+        deformable_attention,
+        "return torch.cat([_attend(",
+        "y, x = (p[:, :, : p.shape[2] // 2].repeat(1, 1, 2, 1, 1, 1) for p in (y, x))\n"
+        "        return torch.cat([_attend(",
+    ),
     "no network after alignment": (rvrt, '(result + self.mlp["1"](result))', "result"),
     "composed again": (rvrt, 'guides[direction] if turn == "2" else None', "None"),
-    "guides of the other direction": (rvrt, 'given = guides[direction] if turn == "2" else None',
-                                      'given = guides["forward" if direction == "backward" else "backward"]'
-                                      ' if turn == "2" else None'),
-    "no activation after the shuffle": (rvrt, "F.leaky_relu(F.pixel_shuffle(self.upsampler[place](x), 2), SLOPE)",
-                                        "F.pixel_shuffle(self.upsampler[place](x), 2)"),
-}  # fmt: skip
+    "guides of the other direction": (
+        rvrt,
+        'given = guides[direction] if turn == "2" else None',
+        'given = guides["forward" if direction == "backward" else "backward"] if turn == "2" else None',
+    ),
+    "no activation after the shuffle": (
+        rvrt,
+        "F.leaky_relu(F.pixel_shuffle(self.upsampler[place](x), 2), SLOPE)",
+        "F.pixel_shuffle(self.upsampler[place](x), 2)",
+    ),
+}
 USES = {  # module: who uses its result, under which name
     rvrt: (golden_rvrt, "RVRT"),
     spynet: (rvrt, "SpyNet"),
@@ -103,11 +123,18 @@ def test_the_published_network_has_the_published_parameters():
     network = RVRT()
     assert sum(parameter.numel() for parameter in network.parameters()) == 11_152_085
     parts = {
-        "spynet": 1_440_300, "feat_extract": 734_076, "backbone.backward_1": 1_101_816,
-        "backbone.forward_1": 1_288_440, "backbone.backward_2": 1_475_064, "backbone.forward_2": 1_661_688,
-        "deform_align.backward_1": 454_032, "reconstruction": 1_292_364, "conv_before_upsampler": 9_280,
-        "upsampler": 332_352, "conv_last": 577,
-    }  # fmt: skip
+        "spynet": 1_440_300,
+        "feat_extract": 734_076,
+        "backbone.backward_1": 1_101_816,
+        "backbone.forward_1": 1_288_440,
+        "backbone.backward_2": 1_475_064,
+        "backbone.forward_2": 1_661_688,
+        "deform_align.backward_1": 454_032,
+        "reconstruction": 1_292_364,
+        "conv_before_upsampler": 9_280,
+        "upsampler": 332_352,
+        "conv_last": 577,
+    }
     for name, count in parts.items():
         assert sum(parameter.numel() for parameter in network.get_submodule(name).parameters()) == count, name
     lines = [line.split("\t") for line in TABLE.read_text().splitlines()[1:]]

@@ -69,20 +69,28 @@ MISTAKES = {  # what is written, what is written wrongly; each exactly once in t
     "order of neighbour and middle": ("torch.cat([neighbour, middle], dim=1)", "torch.cat([middle, neighbour], dim=1)"),
     "shifts not doubled": ("2 * _doubled(coarser)", "_doubled(coarser)"),
     "corners aligned": ("align_corners=False", "align_corners=True"),
-    "offsets (x, y)": ("deform_conv2d(features, offset,",
-                       "deform_conv2d(features, offset.unflatten(1, (-1, 2)).flip(2).flatten(1, 2),"),
-    "offsets by kind": ("deform_conv2d(features, offset,",
-                        "deform_conv2d(features, offset.unflatten(1, (2, -1)).transpose(1, 2).flatten(1, 2),"),
+    "offsets (x, y)": (
+        "deform_conv2d(features, offset,",
+        "deform_conv2d(features, offset.unflatten(1, (-1, 2)).flip(2).flatten(1, 2),",
+    ),
+    "offsets by kind": (
+        "deform_conv2d(features, offset,",
+        "deform_conv2d(features, offset.unflatten(1, (2, -1)).transpose(1, 2).flatten(1, 2),",
+    ),
     "activation at the finest level": ("if level == 2:", "if level:"),
-    "activation after the moved features": ('self[f"L{level}_dcnpack_1"](features, motion)',
-                                            '_leaky(self[f"L{level}_dcnpack_1"](features, motion))'),
+    "activation after the moved features": (
+        'self[f"L{level}_dcnpack_1"](features, motion)',
+        '_leaky(self[f"L{level}_dcnpack_1"](features, motion))',
+    ),
     "cascade on the neighbour": ('self["cas_dcnpack"](aligned, motion)', 'self["cas_dcnpack"](neighbour[0], motion)'),
     "order of the gate": ("torch.cat([aligned, middle], dim=1)", "torch.cat([middle, aligned], dim=1)"),
     "ReLU in the gate": ("self.prelu1(self.conv1(x))", "F.relu(self.conv1(x))"),
-    "gate of another group": ("self.mask0, self.mask1, None, self.mask3, self.mask4)",
-                              "self.mask1, self.mask0, None, self.mask3, self.mask4)"),
+    "gate of another group": (
+        "self.mask0, self.mask1, None, self.mask3, self.mask4)",
+        "self.mask1, self.mask0, None, self.mask3, self.mask4)",
+    ),
     "input frame added": ("return restored / self.unit,", "return (restored + frames[:, 5:6]) / self.unit,"),
-}  # fmt: skip
+}
 
 
 def liveliest(module: types.ModuleType = spk2imgnet):
@@ -110,8 +118,13 @@ def test_each_mistake_is_seen(mistake):
 
 def test_the_published_network_has_the_published_parameters():
     network = Spk2ImgNet()
-    parts = {"extractor": 1_112_592, "pcd_align": 1_532_000, "rec_conv0": 553_152, "rec_conv1": 110_656,
-             "rec_conv2": 577} | {f"mask{group}": 147_650 for group in (0, 1, 3, 4)}  # fmt: skip
+    parts = {
+        "extractor": 1_112_592,
+        "pcd_align": 1_532_000,
+        "rec_conv0": 553_152,
+        "rec_conv1": 110_656,
+        "rec_conv2": 577,
+    } | {f"mask{group}": 147_650 for group in (0, 1, 3, 4)}
     for name, count in parts.items():
         assert sum(parameter.numel() for parameter in getattr(network, name).parameters()) == count
     assert sum(parameter.numel() for parameter in network.parameters()) == sum(parts.values()) == 3_899_577

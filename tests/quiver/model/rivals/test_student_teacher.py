@@ -80,8 +80,12 @@ def test_features_are_compared_without_their_scale_and_mean():
     assert float(feature_distance(a, scale * a + shift)) < 1e-5
     assert float(feature_distance(a, -a)) == pytest.approx(4, rel=1e-4)
     assert float(feature_distance(a, scale * b - shift)) == pytest.approx(float(feature_distance(a, b)), rel=1e-4)
-    correlation = torch.stack([torch.corrcoef(torch.stack([x.flatten(), y.flatten()]))[0, 1]
-                               for x, y in zip(a.flatten(0, 1), b.flatten(0, 1), strict=True)])  # fmt: skip
+    correlation = torch.stack(
+        [
+            torch.corrcoef(torch.stack([x.flatten(), y.flatten()]))[0, 1]
+            for x, y in zip(a.flatten(0, 1), b.flatten(0, 1), strict=True)
+        ]
+    )
     assert float(feature_distance(a, b)) == pytest.approx(float(2 - 2 * correlation.mean()), rel=1e-4)
 
 
