@@ -99,7 +99,14 @@ def members_of(hint: Any) -> tuple[Any, ...]:
 
 def words_of(hint: Any) -> str:
     """Return what a type expects, as in `a whole number from 1 to 16`."""
-    return " or ".join(dict.fromkeys(_words(member) for member in members_of(hint)))
+    found: list[str] = []
+    for member in members_of(hint):
+        item = _item_hint(member, 0)
+        if item is not Any and found and _words(item) == found[-1]:
+            found[-1] += ", or a list of them,"
+        elif (words := _words(member)) not in found:
+            found.append(words)
+    return " or ".join(found).removesuffix(",")
 
 
 def _words(hint: Any) -> str:
@@ -110,7 +117,7 @@ def _words(hint: Any) -> str:
         return str(bounds["words"])
     origin = get_origin(bare)
     if origin is Literal:
-        return "one of " + ", ".join(str(value) for value in get_args(bare))
+        return "one of " + ", ".join(str(value).lower() if value is True else str(value) for value in get_args(bare))
     if origin in (tuple, list):
         return _words_of_list(bare, bounds)
     if bare is bool:
