@@ -10,8 +10,8 @@ import warnings
 import weakref
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
-from qsim import checks
 from qsim.clip.clip_info import Origin
 from qsim.clip.manifest import target_of
 from qsim.dataset import scene_files
@@ -19,29 +19,27 @@ from qsim.files import NAME, Progress
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.fidelity import choose_budget
-from qsim.rendering.render_settings import SIDE
+from qsim.rendering.render_settings import SIDE, RenderSettings
 from qsim.scene import Scene
 from qsim.scene.camera_path import read_camera_path
 from qsim.scenes.colours import coloured
 from qsim.streams.clip import Clip
-
-FRAMES = 21
 
 
 def render(
     scene: Scene | str | os.PathLike[str],
     path: str | os.PathLike[str] | None = None,
     *,
-    frames: int = FRAMES,
+    frames: int = RenderSettings.frames,
     height: int | None = None,
     width: int | None = None,
     seed: int = 0,
     speed: float | None = None,
-    frame_rate: float = 2000.0,
-    shutter: float = 0.0,
-    psnr: float = 40.0,
+    frame_rate: float = RenderSettings.frame_rate,
+    shutter: float = RenderSettings.shutter,
+    psnr: float = RenderSettings.psnr,
     ppp: float | None = None,
-    bands: str | None = None,
+    bands: Literal["rgb"] | None = None,
     camera_path: str | os.PathLike[str] | None = None,
     reuse: bool | None = None,
     budget: Budget | None = None,
@@ -71,6 +69,7 @@ def render(
         raise ValueError("force= replaces the clip of a folder, and no path is given; leave it out")
     if budget is not None and reuse is not None:
         raise ValueError("reuse= is part of the choice of a budget, and budget= replaces it; give one of them")
+    RenderSettings(frames=frames, frame_rate=frame_rate, shutter=shutter, psnr=psnr, reuse=reuse)  # checks them
     if path is not None:
         target_of(path, force)  # before the pilot
     loaded, read = load_scene(scene, height, width, seed, speed, bands, camera_path, frame_rate)
@@ -101,14 +100,12 @@ def load_scene(
     width: int | None,
     seed: int,
     speed: float | None,
-    bands: str | None = None,
+    bands: Literal["rgb"] | None = None,
     camera_path: str | os.PathLike[str] | None = None,
-    frame_rate: float = 2000.0,
+    frame_rate: float = RenderSettings.frame_rate,
 ) -> tuple[Scene, dict[str, str]]:
     """Return a scene in its size, and the SHA-256 of each file that it reads; arguments and errors as of `render`."""
-    for name, side in (("height", height), ("width", width)):
-        if side is not None and not side >= 1:
-            raise ValueError(f"{name} must be a positive whole number of pixels, got {side!r}")
+    RenderSettings(height=height, width=width, frame_rate=frame_rate, bands=bands)  # refuses what does not fit
     if isinstance(scene, Scene):
         if speed is not None:
             raise ValueError(f"scene {scene.name}: a Scene has its motions already; leave speed= out")
@@ -169,11 +166,11 @@ def along_path(
     return replace(scene, camera=camera)
 
 
-def in_bands(scene: Scene, bands: str | None) -> Scene:
-    """Return a scene as it is, or for "rgb" in colour. `ValueError` for other bands, and for a scene with bands."""
+def in_bands(scene: Scene, bands: Literal["rgb"] | None) -> Scene:
+    """Return a scene as it is, or for "rgb" in colour. `ValueError` for a scene that has bands already."""
     if bands is None or (scene.file is not None and scene.bands is not None):  # the file was read in colour
         return scene
-    return coloured(scene) if checks.bands(bands) else scene
+    return coloured(scene)
 
 
 class TemporaryFolder:

@@ -42,7 +42,7 @@ def test_sizes_default_to_the_camera_of_a_record_and_to_a_small_square(tmp_path:
     assert (family.height, family.width) == (SIDE, 40)
     for source in (record, "fan", "lamp"):  # 0 gave the size of a record's camera
         for size in ({"height": 0, "width": 5}, {"height": 5, "width": 0}):
-            with pytest.raises(ValueError, match=r"(height|width) must be a positive whole number of pixels, got 0"):
+            with pytest.raises(ValueError, match=r"(height|width): expected a whole number from 1 to 100000, got 0"):
                 load_scene(source, **size, seed=0, speed=None)
     with pytest.raises(ValueError, match="has its motions already; leave speed= out"):
         load_scene(record, None, None, 0, 2.0)
