@@ -177,6 +177,6 @@ def _declaration(hint: Any) -> Meta | None:
     if get_origin(hint) is not Annotated:
         return None
     for note in get_args(hint)[1:]:
-        if isinstance(note, Meta) and note.description is not None:
+        if isinstance(note, Meta) and "varied" in (note.extra or {}):  # other descriptions are for the JSON Schema
             return note
     return None

@@ -49,7 +49,7 @@ class Choices:
     light_level: Annotated[Light, setting("mean photons", unit="photons/px")] = 3.25
     shares: Annotated[Schedule | None, setting("shares of a code's time")] = None
     group: Annotated[bool, setting("sum planes")] = False
-    made: int = 0  # no setting
+    made: Annotated[int, msgspec.Meta(description="for the schema")] = 0  # no setting
 
     def __post_init__(self) -> None:
         records.settle(self)
