@@ -41,16 +41,15 @@ from rows import (
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
 from quiver.device import default_memory
+from quiver.model.names import EQUAL_COST
 from quiver.model.presets import build
-from quiver.restoration.interface import COMPARED
 from quiver.restoration.pieces import cut_pieces
 
 CLASSICAL = ("moment", "transform-denoise", "qbp", "qbp-bm3d", "path-merge")
 SMALL = ("emvd", "unet", "fastdvdnet", "student-teacher")  # of published width, with fewer multiply-adds than a million
-EQUAL = tuple(f"{name}-1m" for name in ("mergenet", "quiver-s", *COMPARED))
 MODES = "modes"
 RESULTS = ROOT / "docs" / "results" / "bench"
-ROWS = (*CLASSICAL, "mergenet", *SMALL, *EQUAL, MODES)
+ROWS = (*CLASSICAL, "mergenet", *SMALL, *EQUAL_COST, MODES)
 HEADER = ("method", "seconds/frame", "frames/s", "memory [MB]", "GMAC/frame", "PSNR matched [dB]")
 
 

@@ -50,7 +50,7 @@ from qsim.figures import new_figure, write_figure
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
 from quiver.evaluation.breakdown import bin_names
-from quiver.restoration.interface import NETWORKS
+from quiver.model.names import NETWORKS
 
 FORMAT = "quiver-equal-budget-3"
 CLASSICAL = ("moment:3", "moment", "transform-denoise", "qbp", "qbp-bm3d", "path-merge")

@@ -20,7 +20,7 @@ def names(sizes: Sizes) -> list[str]:
 
 def learned() -> list[str]:
     """Return the networks of the project that restore: those that are trained here, and those of `quiver bench`."""
-    from quiver.restoration.interface import NETWORKS
+    from quiver.model.names import NETWORKS
 
     return list(dict.fromkeys([*networks(), *(name for name in NETWORKS if not name.endswith("-as-published"))]))
 

@@ -45,10 +45,10 @@ def names(sizes: Sizes) -> list[str]:
 
 def networks() -> list[str]:
     """Return the networks that are trained here: those of the paper and ours, not the compared ones (rivals/)."""
-    from quiver.model.presets import OTHERS, PRESETS
+    from quiver.model.names import PRESETS
 
-    ours = [name for name, config in OTHERS.items() if ".rivals." not in type(config).__module__]
-    return sorted([*PRESETS, *ours], key=lambda name: (name != COPIED, name in PUBLISHED, name))
+    ours = [name for name, preset in PRESETS.items() if not preset.home.startswith("rivals.")]
+    return sorted(ours, key=lambda name: (name != COPIED, name in PUBLISHED, name))
 
 
 def measure(job: Job) -> list[dict[str, Any]]:

@@ -33,7 +33,8 @@ from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.device import PeakMemory, pick_device
 from quiver.evaluation import metrics
-from quiver.restoration.interface import MODES, NETWORKS, QUIVERS, RestoreOptions, Restorer
+from quiver.model.names import NETWORKS, QUIVERS
+from quiver.restoration.interface import MODES, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, wrap_network
 from quiver.restoration.restorers import restorer, weights_path
 

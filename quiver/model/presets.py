@@ -1,65 +1,40 @@
-"""Makes networks by name: the presets, the ablations of the paper, the control, and the compared networks."""
+"""Makes networks by name (names.py), and the ablations of the paper."""
 
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 import torch
 from torch import nn
+from torch.overrides import TorchFunctionMode
 
+from quiver.model import names
 from quiver.model.config import Config
-from quiver.model.equal_cost import EQUAL_COST
-from quiver.model.mergenet import MergeNet, MergeNetConfig
 from quiver.model.quiver import QUIVER
-from quiver.model.rivals.bit2bit import Bit2Bit, Bit2BitConfig
-from quiver.model.rivals.emvd import EMVD, EMVDConfig
-from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
-from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
-from quiver.model.rivals.memdeblur import MemDeblur, MemDeblurConfig
-from quiver.model.rivals.rvrt import RVRT, RVRTConfig
-from quiver.model.rivals.spk2imgnet import Spk2ImgNet, Spk2ImgNetConfig
-from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
-from quiver.model.unet import UNet, UNetConfig
-from quiver.model.without_values import WithoutValues
 
-PRESETS: dict[str, Config] = {
-    "quiver": Config(),
-    "quiver-s": Config(channels=16),
-}
 
-# The controls and the compared networks: mended, with the sensor's noise or factor, and as their ports have them.
-OTHERS: dict[str, Any] = {
-    "mergenet": MergeNetConfig(),
-    "unet": UNetConfig(),
-    "fastdvdnet": FastDVDnetConfig(),
-    "student-teacher": StudentTeacherConfig(),
-    "bit2bit": Bit2BitConfig(),
-    "emvd": EMVDConfig(),
-    "emvd-as-published": EMVDConfig(as_published=True),
-    "flornn": FloRNNConfig(),
-    "flornn-as-published": FloRNNConfig(as_published=True),
-    "memdeblur": MemDeblurConfig(),
-    "memdeblur-as-published": MemDeblurConfig(group_norm=False, as_published=True),
-    "rvrt": RVRTConfig(),
-    "spk2imgnet": Spk2ImgNetConfig(),
-    "spk2imgnet-as-published": Spk2ImgNetConfig(as_published=True),
-    **{f"{name}-1m": config for name, config in EQUAL_COST.items()},  # a million multiply-adds per pixel and frame
-}
+def _class(home: str) -> type[nn.Module]:
+    """Return the class of a network at module:class in quiver.model."""
+    module, _, name = home.partition(":")
+    network: type[nn.Module] = getattr(import_module(f"quiver.model.{module}"), name)
+    return network
+
+
+def _config_of(network: type[nn.Module]) -> type:
+    """Return the class of a network's configuration, which stands beside it."""
+    module = import_module(network.__module__)
+    kind: type = Config if network is QUIVER else getattr(module, f"{network.__name__}Config")
+    return kind
+
 
 # Each network with its configuration. The name of the class stands in weights files.
-NETWORKS: tuple[tuple[type[nn.Module], type], ...] = (
-    (QUIVER, Config),
-    (MergeNet, MergeNetConfig),
-    (UNet, UNetConfig),
-    (FastDVDnet, FastDVDnetConfig),
-    (StudentTeacher, StudentTeacherConfig),
-    (Bit2Bit, Bit2BitConfig),
-    (EMVD, EMVDConfig),
-    (FloRNN, FloRNNConfig),
-    (MemDeblur, MemDeblurConfig),
-    (RVRT, RVRTConfig),
-    (Spk2ImgNet, Spk2ImgNetConfig),
-)
+NETWORKS: dict[type[nn.Module], type] = {
+    network: _config_of(network) for network in (_class(preset.home) for preset in names.PRESETS.values())
+}
+PRESETS: dict[str, Any] = {
+    name: NETWORKS[_class(preset.home)](**preset.settings) for name, preset in names.PRESETS.items()
+}
 
 # Rows of the paper's Table 4, without that of the pretrained flow: pre-denoiser, flow, multi-scale outputs.
 ABLATIONS: dict[str, tuple[bool, bool, bool]] = {
@@ -100,12 +75,27 @@ def parameter_count(config: Config) -> int:
 
 def build(name: str) -> nn.Module:
     """Return a network by its name, with random weights; ValueError for other names."""
-    known = PRESETS | OTHERS
-    if name not in known:
-        raise ValueError(f"no network is called {name!r}; known: {', '.join(known)}")
-    return made(known[name])
+    if name not in PRESETS:
+        raise ValueError(f"no network is called {name!r}; known: {', '.join(PRESETS)}")
+    return made(PRESETS[name])
 
 
 def made(config: Any) -> nn.Module:
     """Return the network of a configuration of any kind, with random weights."""
-    return next(network(config) for network, kind in NETWORKS if kind is type(config))
+    return next(network(config) for network, kind in NETWORKS.items() if kind is type(config))
+
+
+class WithoutValues(TorchFunctionMode):
+    """Makes layers without first values: every function that sets values in place does nothing.
+
+    On "meta", the first of some of these functions imports for two seconds. `t_` acts, because it sets a
+    shape: `torch.nn.init.orthogonal_` needs it, which does nothing on "meta" in later versions of torch only.
+    """
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        """Run a function, unless it sets values."""
+        if func.__name__.endswith("_") and not func.__name__.endswith("__") and func.__name__ != "t_":
+            return args[0] if args else (kwargs or {})["tensor"]  # the latter for functions of torch.nn.init
+        return func(*args, **(kwargs or {}))

@@ -1,4 +1,4 @@
-"""Converts checkpoints of the published QUIVER to our networks and weights files.
+"""Converts checkpoints of the published QUIVER to our networks and weights files, and loads those of compared networks.
 
 The published names are facts needed for compatibility (tests/data/published_state_dict.tsv). No pickled code is
 executed.
@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from quiver.model.config import Config
 from quiver.model.quiver import QUIVER
@@ -186,3 +186,31 @@ def _read_foreign(path: Path) -> dict[str, Tensor]:
 def _some(names: object, count: int = 3) -> str:
     listed = [str(name) for name in names]  # type: ignore[attr-defined]
     return ", ".join(listed[:count]) + (", ..." if len(listed) > count else "") if listed else "none"
+
+
+# ---- Compared networks, whose layers have the published names
+
+
+def load_published(network: nn.Module, state: Mapping[str, Tensor], unused: tuple[str, ...] = ()) -> list[str]:
+    """Load a published state dict of any shape; return the entries that begin with one of `unused` and are not built.
+
+    Buffers that the state lacks keep their constants. ValueError for parameters that are missing, for unknown entries,
+    and for shapes that differ.
+    """
+    own = network.state_dict()
+    constants = own.keys() - {name for name, _ in network.named_parameters()}
+    left = [name for name in state if name not in own and name.startswith(unused)]
+    title = type(network).__name__
+    missing = sorted(own.keys() - state.keys() - constants)
+    unknown = sorted(state.keys() - own.keys() - set(left))
+    if missing or unknown:
+        name, fault = (missing[0], "is missing") if missing else (unknown[0], "is unknown")
+        raise ValueError(f"not a published state of {title}: {name} {fault}; give all entries of the published network")
+    for name, value in state.items():
+        if name in own and value.shape != own[name].shape:
+            raise ValueError(
+                f"not a published state of this {title}: {name} is {tuple(value.shape)}, expected "
+                f"{tuple(own[name].shape)}; choose the width of the stored weights"
+            )
+    network.load_state_dict({name: value for name, value in state.items() if name in own}, strict=False)
+    return left

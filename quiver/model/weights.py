@@ -18,8 +18,7 @@ from torch import Tensor, nn
 
 from qsim.files import write_bytes
 from qsim.thread_warnings import warnings_here
-from quiver.model.presets import NETWORKS
-from quiver.model.without_values import WithoutValues
+from quiver.model.presets import NETWORKS, WithoutValues
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files
 MAX_CONFIG = 10_000  # characters of a configuration
@@ -125,7 +124,7 @@ def annotate(path: Path, notes: Mapping[str, str | None]) -> None:
 
 def _build(kind: str, values: dict[str, object]) -> nn.Module:
     """Return the network of a kind and the values of its configuration; `ValueError` for others."""
-    for network, config in NETWORKS:
+    for network, config in NETWORKS.items():
         if kind == network.__name__:
             return network(config.from_dict(values))  # type: ignore[attr-defined]
     raise ValueError(f"no network is called {kind[:60]!r}")

@@ -11,21 +11,13 @@ from numpy import ndarray as Array
 from qsim.files import Progress
 from quiver.data.codes import Codes, light_of
 from quiver.device import HOST_MEMORY, default_memory, pick_device
+from quiver.model.names import NETWORKS as NETWORKS
+from quiver.model.names import QUIVERS as QUIVERS
 from quiver.restoration.domain import UP_TO_A_FACTOR, Scope, place_of, remark
 from quiver.restoration.mosaics import by_colour, fill_mosaic
 
 AUTO = "auto"  # chooses the method of a stream: see automatic.py
 DEFAULT_METHOD = AUTO  # of `quiver restore` and `quiver.restore`
-# Presets: see quiver/model/presets.py. Those of equal cost: quiver/model/equal_cost.py.
-QUIVERS = ("quiver-s", "quiver")
-COMPARED = ("unet", "fastdvdnet", "student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
-NETWORKS = (
-    *QUIVERS,
-    "mergenet",
-    *COMPARED,
-    *(f"{name}-as-published" for name in ("emvd", "flornn", "memdeblur", "spk2imgnet")),
-    *(f"{name}-1m" for name in ("quiver-s", "mergenet", *COMPARED)),
-)
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/model/schedules.py
 
 # Adds the photons of frames `first` ... to zeros [t, H, W]; called with (codes, zeros, first, progress)

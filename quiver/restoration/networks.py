@@ -47,12 +47,12 @@ def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
 
 def network_title(model: nn.Module) -> str:
     """Return a title for people: `QUIVER (quiver-s)`, `U-Net`, `EMVD (emvd)`."""
-    from quiver.model.presets import OTHERS, PRESETS
+    from quiver.model.presets import PRESETS
     from quiver.model.unet import UNet
 
     if isinstance(model, UNet):
         return "U-Net"
-    preset = next((name for name, config in (PRESETS | OTHERS).items() if config == model.config), None)
+    preset = next((name for name, config in PRESETS.items() if config == model.config), None)
     return type(model).__name__ if preset is None else f"{type(model).__name__} ({preset})"
 
 

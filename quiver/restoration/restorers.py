@@ -24,7 +24,8 @@ from qsim.files import Progress
 from quiver.baselines import METHODS, exposures
 from quiver.baselines.sliding_window import look_ahead
 from quiver.data.codes import Codes
-from quiver.restoration.interface import AUTO, NETWORKS, RestoreInto, RestoreOptions, Restorer
+from quiver.model.names import NETWORKS
+from quiver.restoration.interface import AUTO, RestoreInto, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"  # weights that ship with the package

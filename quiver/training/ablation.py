@@ -18,6 +18,7 @@ from quiver.device import pick_device
 from quiver.evaluation.comparison import Comparison, ComparisonRow, evaluate
 from quiver.evaluation.summary import summarise
 from quiver.model.config import Config
+from quiver.model.names import QUIVERS
 from quiver.model.presets import ABLATIONS, PRESETS, ablated, parameter_count
 from quiver.model.quiver import QUIVER
 from quiver.restoration.interface import RestoreOptions, Restorer
@@ -31,8 +32,8 @@ HEADER = ("pre-denoiser", "flow", "multi-scale", "parameters", "PSNR matched", "
 
 def networks(preset: str) -> dict[str, Config]:
     """Return the six configurations by name; ValueError if the preset has no ablation."""
-    if preset not in PRESETS:
-        raise ValueError(f"no ablation of {preset!r}; there is one of {', '.join(PRESETS)}")
+    if preset not in QUIVERS:
+        raise ValueError(f"no ablation of {preset!r}; there is one of {', '.join(QUIVERS)}")
     return {name: ablated(PRESETS[preset], name) for name in ABLATIONS}
 
 

@@ -8,9 +8,9 @@ import torch
 from golden import Recorder, fill_by_rule
 from torch import Tensor
 
+from quiver.model.published_weights import load_published
 from quiver.model.rivals.emvd import EMVD, EMVDConfig
 from quiver.model.rivals.noise import table_of
-from quiver.model.rivals.published_names import load_published
 
 INPUTS = ("codes", "noise_ab")
 MULTIPLE = 8

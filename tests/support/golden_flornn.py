@@ -10,9 +10,9 @@ import torch
 from golden import fill_by_rule
 from torch import Tensor, nn
 
+from quiver.model.published_weights import load_published
 from quiver.model.rivals.edges import reflected
 from quiver.model.rivals.flornn import FloRNN, FloRNNConfig, Flows
-from quiver.model.rivals.published_names import load_published
 
 INPUTS = ("codes", "noise_map", "flow_forward", "flow_backward")
 SLICE = 4  # every fourth channel of a state is stored

@@ -7,8 +7,8 @@ import torch
 from golden import Recorder, fill_by_rule
 from torch import Tensor, nn
 
+from quiver.model.published_weights import load_published
 from quiver.model.rivals.memdeblur import MemDeblur, MemDeblurConfig
-from quiver.model.rivals.published_names import load_published
 
 INPUTS = ("codes",)
 MULTIPLE = 4

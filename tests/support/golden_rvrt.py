@@ -7,7 +7,7 @@ import torch
 from golden import Recorder, fill_by_rule
 from torch import Tensor
 
-from quiver.model.rivals.published_names import load_published
+from quiver.model.published_weights import load_published
 from quiver.model.rivals.rvrt import CLIP, PASSES, QUARTER, RVRT, RVRTConfig, reduced
 
 INPUTS = ("codes",)

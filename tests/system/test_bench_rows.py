@@ -12,7 +12,7 @@ import pytest
 
 from qsim.files import write_json
 from quiver.evaluation.cost import checked_cases
-from quiver.restoration.interface import NETWORKS
+from quiver.model.names import NETWORKS
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import bench_rows

@@ -13,6 +13,6 @@ A network that restores one frame of a window has `frames_in`, the length of its
 [B, T, 1, H, W], T >= frames_in, sides as inside -> those whose window lies in the clip [B, T - frames_in + 1, 1, H, W].
 
 Those with published programs (EMVD, FloRNN, MemDeblur, RVRT, Spk2ImgNet) have published names in their state dict;
-`published_names.load_published` loads such a state. `unused` are beginnings of published names that are declared there
-but never used, and not built here.
+`load_published` of `quiver.model.published_weights` loads such a state. `unused` are beginnings of published names that
+are declared there but never used, and not built here.
 """

@@ -27,10 +27,11 @@ from quiver.evaluation.cost import (
     markdown,
     measure,
 )
+from quiver.model.names import NETWORKS
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
-from quiver.restoration.interface import NETWORKS, Restorer
+from quiver.restoration.interface import Restorer
 
 
 def test_the_clip_is_fixed_and_as_bright_as_asked():

@@ -8,16 +8,15 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from quiver.evaluation.macs import MacCounter, design_macs, macs, macs_per_pixel
-from quiver.model.equal_cost import EQUAL_COST
 from quiver.model.mergenet import MergeNetConfig
-from quiver.model.presets import made
+from quiver.model.names import COMPARED, EQUAL_COST
+from quiver.model.presets import PRESETS, made
 from quiver.model.rivals.edges import pad_space
 from quiver.model.rivals.emvd import EMVDConfig
 from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
 from quiver.model.rivals.rvrt import RVRTConfig
 from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
 from quiver.model.unet import UNetConfig
-from quiver.restoration.interface import COMPARED
 
 
 class Layers(nn.Module):
@@ -87,14 +86,14 @@ def test_rvrt_costs_what_its_layers_cost():
     assert design_macs(RVRTConfig()) == pytest.approx(744_091, rel=1e-3)
 
 
-SLOW = ("memdeblur", "rvrt", "spk2imgnet", "flornn", "emvd", "quiver-s")  # three to twelve seconds
+SLOW = ("memdeblur-1m", "rvrt-1m", "spk2imgnet-1m", "flornn-1m", "emvd-1m", "quiver-s-1m")  # three to twelve seconds
 
 
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in EQUAL_COST]
 )
 def test_networks_of_equal_cost_cost_a_million(name):
-    assert 0.9e6 < design_macs(EQUAL_COST[name]) < 1.1e6
+    assert 0.9e6 < design_macs(PRESETS[name]) < 1.1e6
 
 
 @pytest.mark.parametrize("config", [UNetConfig(2), EMVDConfig(width=2), MergeNetConfig(width=3)])
@@ -120,4 +119,4 @@ def test_torch_counts_the_same(name):
 
 
 def test_every_compared_network_has_a_size_of_equal_cost():
-    assert set(EQUAL_COST) == {*COMPARED, "quiver-s", "mergenet"}
+    assert set(EQUAL_COST) == {f"{name}-1m" for name in (*COMPARED, "quiver-s", "mergenet")}

@@ -7,7 +7,7 @@ import torch
 from runs import EVERY
 
 from quiver.model.mergenet import INPUTS
-from quiver.model.without_values import WithoutValues
+from quiver.model.presets import WithoutValues
 
 
 @pytest.mark.parametrize("name", EVERY)

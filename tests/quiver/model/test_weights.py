@@ -22,7 +22,7 @@ from torch import nn
 
 from qsim.process import peak_memory, reset_peak
 from quiver.model.config import Config
-from quiver.model.presets import OTHERS
+from quiver.model.presets import PRESETS
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import annotate, digest, load, save
@@ -117,7 +117,7 @@ def test_networks_are_read_where_orthogonal_values_are_made_on_meta_too(tmp_path
 
 
 def test_the_shipped_weights_are_those_of_the_preset():
-    assert load(weights_path("mergenet")).config == OTHERS["mergenet"]
+    assert load(weights_path("mergenet")).config == PRESETS["mergenet"]
 
 
 def test_weights_that_do_not_fit_are_refused(tmp_path: Path):

@@ -18,7 +18,7 @@ from runs import EVERY, tiny
 from torch import nn
 
 from quiver.data.codes import Codes
-from quiver.model.presets import OTHERS
+from quiver.model.names import COMPARED
 from quiver.model.weights import save
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, wrap_network
@@ -146,7 +146,7 @@ print(peak_memory() - before)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in OTHERS if not name.endswith(("-1m", "-as-published"))])
+@pytest.mark.parametrize("name", ["mergenet", *COMPARED])
 def test_the_memory_bound_holds(name):
     """400 MB for frames of 256 x 256 px; peak of resident pages, in a separate process. QUIVER: test_networks.py."""
     run = subprocess.run(

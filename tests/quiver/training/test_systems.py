@@ -20,15 +20,16 @@ from quiver.data.clips import open_clips
 from quiver.data.codes import Codes
 from quiver.data.noise_table import noise_table
 from quiver.data.windows import Windows, WindowSettings
+from quiver.model.names import NETWORKS, QUIVERS
 from quiver.model.presets import NETWORKS as KINDS
-from quiver.model.presets import OTHERS, PRESETS, build
+from quiver.model.presets import build
 from quiver.model.quiver import QUIVER
 from quiver.model.rivals.flornn import FloRNN, FloRNNConfig, Flows
 from quiver.model.rivals.memdeblur import MemDeblur, MemDeblurConfig
 from quiver.model.rivals.rvrt import RVRT, RVRTConfig
 from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
 from quiver.model.weights import load
-from quiver.restoration.interface import NETWORKS, QUIVERS, RestoreOptions
+from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import wrap_network
 from quiver.training import loop as training
 from quiver.training.loop import train
@@ -337,13 +338,11 @@ def test_the_published_protocols_are_those_of_the_ports():
 
 def test_every_preset_has_a_system_and_a_quick_protocol():
     known = {field.name for field in fields(Settings)}
-    assert set(NETWORKS) == {*PRESETS, *OTHERS}
-    assert set(QUIVERS) == set(PRESETS)
     for name in NETWORKS:
         system = system_named(name)
         assert set(protocol(system, "quick")) <= known
-        assert (system is OURS) == (name in ("quiver-s-1m", *PRESETS))
-    assert {kind for kind, _ in KINDS} >= set(SYSTEMS)
+        assert (system is OURS) == (name in ("quiver-s-1m", *QUIVERS))
+    assert set(KINDS) >= set(SYSTEMS)
     with pytest.raises(ValueError, match="--protocol paper: emvd has quick and published"):
         protocol(system_named("emvd"), "paper")
 

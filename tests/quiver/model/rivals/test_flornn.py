@@ -30,9 +30,9 @@ from golden import (
 )
 from torch import Tensor
 
+from quiver.model.published_weights import load_published
 from quiver.model.rivals import flornn
 from quiver.model.rivals.flornn import FloRNN, FloRNNConfig, Flows, reflected_flows, warp_inside
-from quiver.model.rivals.published_names import load_published
 
 TABLE = DATA / "flornn_state_dict.tsv"
 SIZES = FloRNNConfig(width=4, blocks=2, look_ahead=3, flow_channels=(), as_published=True)

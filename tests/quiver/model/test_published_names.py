@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from quiver.model.rivals.published_names import load_published
+from quiver.model.published_weights import load_published
 
 STATE = {"weight": torch.ones(2, 3), "bias": torch.zeros(2), "head.weight": torch.ones(4)}
 
