@@ -142,12 +142,12 @@ def _restore_cubes(args: argparse.Namespace) -> int:
             note(text)
     target.parent.mkdir(parents=True, exist_ok=True)
     with bar(method.name) as progress:
-        meta = restore_cubes(found, method, planes, target, progress, force=args.force)
-    score = "no truth beside them" if meta["psnr"] is None else f"PSNR {meta['psnr']:.2f} dB"
+        info = restore_cubes(found, method, planes, target, progress, force=args.force)
+    score = "no truth beside them" if info.psnr is None else f"PSNR {info.psnr:.2f} dB"
     output(
         args,
-        {"submission": str(target)} | meta,
+        {"submission": str(target)} | records.plain(info, complete=True),
         f"{target}: {len(found)} pictures by {method.name}, {planes} planes per code, {score}, "
-        f"{meta['seconds_per_picture']:.3g} s per picture",
+        f"{info.seconds_per_picture:.3g} s per picture",
     )
     return 0

@@ -13,21 +13,39 @@ import math
 import time
 import zipfile
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files
+from qsim import descriptions, files
 from qsim.colour import psnr
 from qsim.files import VERSION, Progress
+from qsim.kinds import Count, NotNegative, Number, Planes, Text
 from quiver.data.challenge import COLOURS, Cube, band_codes, light_of_band, picture
 from quiver.restoration.interface import Restorer
 from quiver.restoration.restored_file import check_finite
 
-FORMAT = "quiver-submission-1"
 _DATE = (1980, 1, 1, 0, 0, 0)  # of every picture: the same pictures make the same zip
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubmissionInfo:
+    """The description of a submission: OUT.json without its format version and its own checksum."""
+
+    FORMAT: ClassVar[str] = "quiver-submission"
+
+    method: Text
+    description: str = ""  # of the method, in words
+    identity: dict[str, Any] = field(default_factory=dict)  # settings and weights of the method
+    planes_per_code: Planes
+    pictures: Count
+    psnr: Number | None = None  # dB, mean over the pictures whose truth is known
+    psnr_of_pictures: dict[str, Number | None] = field(default_factory=dict)  # dB, by SCENE/NUMBER
+    seconds_per_picture: NotNegative
+    quiver: str = ""  # version of the program
 
 
 def restore_cubes(
@@ -38,7 +56,7 @@ def restore_cubes(
     progress: Progress | None = None,
     *,
     force: bool = False,
-) -> dict[str, Any]:
+) -> SubmissionInfo:
     """Write the last planes of cubes, restored from codes of `planes` planes, to PATH.zip; return its description.
 
     `FileExistsError` for a result without `force`, and for files that this function did not write; `ValueError` for
@@ -62,22 +80,21 @@ def restore_cubes(
                 archive.writestr(zipfile.ZipInfo(f"{cube.name}.png", _DATE), _png(made))
                 scores[cube.name] = None if truth is None else picture_psnr(made, truth)
         known = [score for score in scores.values() if score is not None]
-        meta = {
-            "format": FORMAT,
-            "quiver": VERSION,
-            "method": method.name,
-            "description": method.description,
-            "identity": dict(method.identity),
-            "planes_per_code": planes,
-            "pictures": len(cubes),
-            "psnr": sum(known) / len(known) if known else None,
-            "psnr_of_pictures": scores,
-            "seconds_per_picture": (time.perf_counter() - started) / len(cubes),
-        }
-        described.write(files.to_json(files.sealed(meta)))
+        info = SubmissionInfo(
+            quiver=VERSION,
+            method=method.name,
+            description=method.description,
+            identity=dict(method.identity),
+            planes_per_code=planes,
+            pictures=len(cubes),
+            psnr=sum(known) / len(known) if known else None,
+            psnr_of_pictures=scores,
+            seconds_per_picture=(time.perf_counter() - started) / len(cubes),
+        )
+        described.write(files.to_json(descriptions.values_of(info)))
     if progress is not None:
         progress(len(cubes), len(cubes))
-    return meta
+    return info
 
 
 def restore_last(cube: Cube, method: Restorer, planes: int) -> Array:
@@ -105,7 +122,7 @@ def check_target(path: Path, force: bool) -> None:
         if (file.exists() or file.is_symlink()) and not force:
             raise FileExistsError(f"{file}: exists; name another with -o, or use --force to replace it")
     there = path.exists() or path.is_symlink() or description.exists()
-    ours = description.is_file() and files.read_json(description).get("format") == FORMAT
+    ours = description.is_file() and files.read_json(description).get("format") == SubmissionInfo.FORMAT
     if there and (not ours or path.is_dir() or path.is_symlink()):
         raise FileExistsError(
             f"{path}: is not a submission with its .json, which is all that --force replaces; name another with -o"

@@ -79,9 +79,9 @@ def test_restored_levels_are_those_of_the_cube(tmp_path):
 
 def test_without_truth_there_is_no_score(tmp_path):
     found = cubes(static_cubes(tmp_path / "cubes", planes=3, truth=False))
-    meta = restore_cubes(found, restorer("naive"), 1, tmp_path / "a.zip")
-    assert meta["psnr"] is None
-    assert meta["psnr_of_pictures"] == {"day/000007": None, "night/000007": None}
+    info = restore_cubes(found, restorer("naive"), 1, tmp_path / "a.zip")
+    assert info.psnr is None
+    assert info.psnr_of_pictures == {"day/000007": None, "night/000007": None}
 
 
 def test_psnr_of_pictures():
