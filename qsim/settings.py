@@ -94,6 +94,8 @@ class Setting:
 
 def settings_of(kind: Any) -> tuple[Setting, ...]:
     """Return the declared settings of a record, in order; its other fields are no settings."""
+    if not any("setting(" in str(field.type) or not isinstance(field.type, str) for field in dataclasses.fields(kind)):
+        return ()  # its types may be known to type checkers alone
     hints = records.hints_of(kind)
     found = []
     for field in dataclasses.fields(kind):

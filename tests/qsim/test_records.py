@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Annotated
 
+import hypothesis
 import msgspec
 import numpy as np
 import pytest
@@ -101,6 +102,7 @@ plain_values = st.recursive(
 )
 
 
+@hypothesis.settings(deadline=None)
 @over(st.dictionaries(st.sampled_from([f.name for f in dataclasses.fields(Table)]), plain_values, max_size=4))
 def test_any_table_becomes_a_record_or_one_sentence(found):
     refusal = ""
