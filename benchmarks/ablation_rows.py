@@ -36,9 +36,9 @@ from rows import (
 )
 from step_rows import Steps, refuse_busy, together
 
-from qsim.cli.options import count
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
+from qsim.words import count
 from quiver.device import pick_device
 from quiver.model.config import Config
 from quiver.model.presets import ABLATIONS, ablated, parameter_count

@@ -22,9 +22,9 @@ from equal_budget import APART, FLOOR, HEADER, RECORD, ROWS, classical, learned,
 from rows import LIGHTS, TINY, check_row, keep_apart, missing_rows, notes_on, options, scores
 from step_rows import Steps, refuse_busy, together
 
-from qsim.cli.options import count
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
+from qsim.words import count
 
 FORMAT = "quiver-equal-steps-1"
 AT = f"{float(LIGHTS[0]):g} PPP, 3 bit"

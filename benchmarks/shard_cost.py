@@ -21,7 +21,6 @@ from shard_contents import contents
 from shard_page import WAYS, draw, page
 
 from qsim import files
-from qsim.cli.options import part_of
 from qsim.dataset import recipe
 from qsim.dataset.cost_forecast import kinds_of
 from qsim.dataset.dataset import Dataset
@@ -29,6 +28,7 @@ from qsim.dataset.generation import shard
 from qsim.dataset.recipe import Recipe
 from qsim.files import VERSION, read_json, write_bytes, write_json
 from qsim.streams.clip import Clip
+from qsim.words import part_of
 
 ROOT = Path(__file__).parents[1]
 FORMAT = "qsim-shard-1"

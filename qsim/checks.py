@@ -15,6 +15,15 @@ SPLITS = ("train", "val", "test")
 MAX_PIXELS = 1 << 26  # of one frame: 8192 x 8192
 
 
+class ArgumentError(ValueError):
+    """A value that cannot be used, by the name of its argument; command lines replace the name by that of an option."""
+
+    def __init__(self, argument: str, problem: str) -> None:
+        super().__init__(f"{argument}: {problem}")
+        self.argument = argument
+        self.problem = problem
+
+
 def suggest(word: str, known: Iterable[str]) -> str:
     """Return ` (did you mean '...'?)`, or an empty text if no known word is close."""
     close = difflib.get_close_matches(word, list(known), n=1)

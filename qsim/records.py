@@ -91,10 +91,17 @@ def hints_of(kind: Any) -> dict[str, Any]:
 
 def members_of(hint: Any) -> tuple[Any, ...]:
     """Return the alternatives of a type, None apart: those of `A | B | None` are A and B."""
-    bare = _bare(hint)
+    bare = bare_type(hint)
     if get_origin(bare) in (Union, types.UnionType):
         return tuple(inner for member in get_args(bare) for inner in members_of(member))
     return () if bare is type(None) else (hint,)
+
+
+def bare_type(hint: Any) -> Any:
+    """Return a type without its annotations."""
+    while get_origin(hint) in (Annotated, Required, NotRequired):
+        hint = get_args(hint)[0]
+    return hint
 
 
 def words_of(hint: Any) -> str:
@@ -111,8 +118,8 @@ def words_of(hint: Any) -> str:
 
 def _words(hint: Any) -> str:
     """Return what one alternative of a type expects."""
-    bare = _bare(hint)
-    bounds = _bounds(hint)
+    bare = bare_type(hint)
+    bounds = bounds_of(hint)
     if "words" in bounds:
         return str(bounds["words"])
     origin = get_origin(bare)
@@ -167,14 +174,7 @@ def _figure(number: float) -> str:
     return f"{number:g}" if isinstance(number, float) else str(number)
 
 
-def _bare(hint: Any) -> Any:
-    """Return a type without its annotations."""
-    while get_origin(hint) in (Annotated, Required, NotRequired):
-        hint = get_args(hint)[0]
-    return hint
-
-
-def _bounds(hint: Any) -> dict[str, Any]:
+def bounds_of(hint: Any) -> dict[str, Any]:
     """Return what the annotations of a type state: ge, gt, le, lt, min_length, max_length, pattern, and its words."""
     found: dict[str, Any] = {}
     while get_origin(hint) in (Annotated, Required, NotRequired):
@@ -194,7 +194,7 @@ def _bounds(hint: Any) -> dict[str, Any]:
 def _refuse_unknown(found: Any, hint: Any, where: str, path: str, advice: str) -> None:
     """Raise `ValueError` for the first key that a record of this type does not have."""
     for member in members_of(hint):
-        bare = _bare(member)
+        bare = bare_type(member)
         if isinstance(found, Mapping) and dataclasses.is_dataclass(bare):
             known = hints_of(bare)
             for key, value in found.items():
@@ -247,7 +247,7 @@ def _at(path: str, hint: Any, value: Any) -> tuple[Any, Any]:
 
 def _first_misfit(hint: Any, values: Mapping[str, Any]) -> tuple[Any, Any]:
     """Return type and value of the first entry of a dictionary that does not fit."""
-    (kind,) = (get_args(_bare(member))[1] for member in members_of(hint) if get_origin(_bare(member)) is dict)
+    (kind,) = (get_args(bare_type(member))[1] for member in members_of(hint) if get_origin(bare_type(member)) is dict)
     for value in values.values():
         try:
             msgspec.convert(value, kind)
@@ -259,7 +259,7 @@ def _first_misfit(hint: Any, values: Mapping[str, Any]) -> tuple[Any, Any]:
 def _field_hint(hint: Any, name: str) -> Any:
     """Return the type of a field of a record or a typed dictionary."""
     for member in members_of(hint):
-        bare = _bare(member)
+        bare = bare_type(member)
         if dataclasses.is_dataclass(bare):
             return hints_of(bare)[name]
         if is_typeddict(bare):
@@ -269,7 +269,7 @@ def _field_hint(hint: Any, name: str) -> Any:
 
 def _misfit_key(hint: Any, values: Mapping[Any, Any]) -> str:
     """Return what is expected of the keys of a dictionary, and the first that does not fit."""
-    (kind,) = (get_args(_bare(member))[0] for member in members_of(hint) if get_origin(_bare(member)) is dict)
+    (kind,) = (get_args(bare_type(member))[0] for member in members_of(hint) if get_origin(bare_type(member)) is dict)
     for key in values:
         try:
             msgspec.convert(key, kind)
@@ -281,8 +281,8 @@ def _misfit_key(hint: Any, values: Mapping[Any, Any]) -> str:
 def _item_hint(hint: Any, number: int) -> Any:
     """Return the type of an item of a list."""
     for member in members_of(hint):
-        kinds = [item for item in get_args(_bare(member)) if item is not Ellipsis]
-        if get_origin(_bare(member)) in (list, tuple) and kinds:
+        kinds = [item for item in get_args(bare_type(member)) if item is not Ellipsis]
+        if get_origin(bare_type(member)) in (list, tuple) and kinds:
             return kinds[min(number, len(kinds) - 1)]
     return Any
 
@@ -292,10 +292,12 @@ def _settled(value: Any, hint: Any) -> Any:
 
     Objects that no file holds are instances of one of the classes that the type names.
     """
+    if isinstance(value, tuple) and value and all(dataclasses.is_dataclass(item) for item in value):
+        return value  # records have settled themselves
     classes = []
     alternatives = []
     for member in members_of(hint):
-        bare = _bare(member)
+        bare = bare_type(member)
         if get_origin(bare) is Callable and callable(value):
             return value
         if isinstance(bare, type) and get_origin(bare) is None and not _is_plain(bare):
@@ -327,7 +329,7 @@ def _of_python(value: Any) -> Any:
 
 def _may_be_none(hint: Any) -> bool:
     """Return whether None is one of the alternatives of a type."""
-    bare = _bare(hint)
+    bare = bare_type(hint)
     if get_origin(bare) in (Union, types.UnionType):
         return any(_may_be_none(member) for member in get_args(bare))
     return bare is type(None)
@@ -335,7 +337,7 @@ def _may_be_none(hint: Any) -> bool:
 
 def is_of_files(member: Any) -> bool:
     """Return whether one alternative of a type is a plain value, as TOML and JSON hold it."""
-    bare = _bare(member)
+    bare = bare_type(member)
     return get_origin(bare) is not None or _is_plain(bare)
 
 

@@ -12,13 +12,16 @@ import dataclasses
 import functools
 import inspect
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, dataclass
-from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Concatenate, Literal, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
 
 from msgspec import Meta
 
 from qsim import records
+from qsim.checks import shown, suggest
+
+Several = Literal["", "following", "repeated"]
 
 Fields = ParamSpec("Fields")
 Record = TypeVar("Record")
@@ -36,6 +39,12 @@ def setting(
     shown: str = "",
     varied: bool = False,
     recipe: bool = True,
+    positional: bool = False,
+    several: Several = "",
+    read: Callable[[str], Any] | None = None,
+    choices: Sequence[str] = (),
+    known: Callable[[], Iterable[str]] | None = None,
+    section: str = "",
 ) -> Meta:
     """Describe a field of a record of settings.
 
@@ -43,9 +52,16 @@ def setting(
     `option` is the name on the command line where it is not the field's, `short` its letter, and `shown` what stands
     for its value. A `varied` setting may be a list on the command line and in a recipe: one result per value. `recipe`
     is False if recipes have no such key.
+
+    The rest is of command lines. A `positional` setting has no option. A list is given with commas, or as `several`
+    words that follow its option, or by a `repeated` option. `read` makes a value of a word that its type does not
+    explain, such as `2GB`. A text may be limited to `choices`; `known` returns names that a shell completes, beside
+    others that the setting takes. `section` is a heading of the help.
     """
-    extra = {"unit": unit, "unset": unset, "option": option, "short": short, "shown": shown}
-    return Meta(description=words, extra=extra | {"varied": varied, "recipe": recipe})
+    extra: dict[str, Any] = {"unit": unit, "unset": unset, "option": option, "short": short, "shown": shown}
+    extra |= {"varied": varied, "recipe": recipe, "positional": positional, "several": several}
+    extra |= {"read": read, "choices": tuple(choices), "known": known, "section": section}
+    return Meta(description=words, extra=extra)
 
 
 @dataclass(frozen=True)
@@ -64,6 +80,12 @@ class Setting:
     varied: bool
     recipe: bool
     meta: Meta  # the declaration
+    positional: bool = False
+    several: Several = ""
+    read: Callable[[str], Any] | None = None
+    choices: tuple[str, ...] = ()
+    known: Callable[[], Iterable[str]] | None = None
+    section: str = ""
 
     @property
     def required(self) -> bool:
@@ -72,14 +94,14 @@ class Setting:
     @property
     def expected(self) -> str:
         """What its type expects, in words."""
-        return records.words_of(self.hint)
+        return f"one of {', '.join(self.choices)}" if self.choices else records.words_of(self.hint)
 
     @property
     def default_words(self) -> str:
         """The default as the help and the manual print it; empty for a setting that must be given, or that is off."""
         if self.unset:
             return self.unset
-        if self.required or self.default is None or self.default is False:
+        if self.required or self.default is None or self.default is False or self.default == ():
             return ""
         return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
 
@@ -104,10 +126,24 @@ def settings_of(kind: Any) -> tuple[Setting, ...]:
         if declared is None:
             continue
         default = field.default if field.default_factory is MISSING else field.default_factory()
-        extra = dict(declared.extra or {})
+        extra: dict[str, Any] = dict(declared.extra or {})
         extra["option"] = extra["option"] or field.name.replace("_", "-")
         found.append(Setting(field.name, hint, default, declared.description or "", **extra, meta=declared))
     return tuple(found)
+
+
+def settle(record: Any) -> None:
+    """Bring the fields of a record of settings into the form of their types, and check choices; for `__post_init__`.
+
+    `ValueError` with field, what is expected and what was given if a value does not fit.
+    """
+    records.settle(record)
+    for one in settings_of(type(record)):
+        value = getattr(record, one.name)
+        if one.choices and value is not None and value not in one.choices:
+            raise ValueError(
+                f"{one.name}: expected {one.expected}, got {shown(value)}{suggest(str(value), one.choices)}"
+            )
 
 
 def given(record: Any) -> dict[str, Any]:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-DEVICES = ("auto", "cpu", "cuda")  # values of --device
+DEVICES = ("auto", "cpu", "cuda")
 HOST_MEMORY = 2_000_000_000  # bytes; working memory where none is stated and no GPU runs
 
 

@@ -2,187 +2,225 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from qsim import checks
-from qsim.cli.console import command, output, refuse_existing
-from qsim.cli.options import checked
-from qsim.cli.reader_options import LAYOUT, add_reader_options, hints_of
-
-
-def add_calibrate(sub: Any) -> None:
-    """Add the command `calibrate` to a program."""
-    parser = command(
-        sub,
-        "calibrate",
-        _run_calibrate,
-        "Measure a sensor from dark and flat frames; write its file.",
-        "qsim calibrate --bits 8 --dark d1.npy 1e-3 --dark d2.npy 0.1 --flat f.npy 1e-3 --flat g.npy 1e-3 -o my.toml\n"
-        "qsim calibrate --model spad --bits 1 --dark dark.npy 1e-5 --flat flat.npy 1e-5 0.8 -o spad.toml\n"
-        "qsim calibrate --bits 8 --static counts.npy 6.33e-6 -o counter.toml",
-    )
-    for option, names, what in (
-        ("--dark", ("FILE", "SECONDS"), "frames without light, and their exposure"),
-        ("--flat", ("FILE", "SECONDS"), "evenly lit frames, their exposure, and the photons per pixel if known"),
-    ):
-        parser.add_argument(option, metavar=names, help=what, action="append", nargs="+", default=[])
-    parser.add_argument(
-        "--static",
-        nargs=2,
-        metavar=("FILE", "SECONDS"),
-        help="counts of a static scene, instead of dark and flat frames: measures the dead time from Fano factors",
-    )
-    parser.add_argument(
-        "--bits",
-        type=checked(checks.bits),
-        help="bits per code; 1 for binary planes (default with --planes of 2 or more: 1)",
-    )
-    parser.add_argument(
-        "--planes",
-        type=checked(checks.planes),
-        help="spad: every value is the sum of this many binary planes, SECONDS and PHOTONS are those of one plane; "
-        "1: values are single exposures",
-    )
-    parser.add_argument("--model", choices=("qis", "spad"), help="kind of sensor (default qis; spad with --planes)")
-    parser.add_argument("--paralyzable", action="store_true", help="spad: every arrival restarts the dead time")
-    parser.add_argument("--ignore-dead-time", action="store_true", help="spad: model the counts as Poisson")
-    reading = parser.add_argument_group("where the values of the files lie")
-    add_reader_options(reading, LAYOUT, width="pixels of a row of packed planes: .npy files are photon cubes")
-    parser.add_argument("-o", "--output", type=Path, required=True, help=".toml to write; .json and .png beside it")
-    parser.add_argument("--force", action="store_true", help="replace existing files")
-
-
-def _run_calibrate(args: argparse.Namespace) -> int:
-    from qsim.calibration import sensor_file
-    from qsim.calibration.qis import calibrate_qis
-    from qsim.calibration.spad import calibrate_spad
-
-    if args.output.suffix != ".toml":
-        raise ValueError(f"{args.output}: the sensor file is a .toml, as in -o my_sensor.toml")
-    model, bits = _calibration_kind(args)
-    _check_outputs(args, model)
-    darks = [_stack(words, args, bits, dark=True) for words in args.dark]
-    flats = [_stack(words, args, bits, dark=False) for words in args.flat]
-    if args.static:
-        found = _static(args, bits)
-    elif model == "qis":
-        found = calibrate_qis(darks, flats, bits=bits)
-    else:
-        found = calibrate_spad(
-            darks, flats, bits=bits, dead_time=not args.ignore_dead_time, paralyzable=args.paralyzable
-        )
-    args.output.parent.mkdir(parents=True, exist_ok=True)
-    stacks = f"{len(darks)} dark and {len(flats)} flat stacks"
-    origin = f"counts of the static scene {Path(args.static[0]).name}" if args.static else stacks
-    written = sensor_file.write(found, args.output, f"calibrated from {origin}")
-    width = max(len(name) for name in found.values)
-    assumed = _assumed(args, model, bits)
-    text = [f"taken as: {assumed}"]
-    text += [f"{name:{width}}  {value}  ({value.method})" for name, value in found.values.items()]
-    text += [f"warning: {words}" for words in found.warnings]
-    text += ["written: " + ", ".join(str(path) for path in written)]
-    output(args, sensor_file.as_dict(found) | {"assumed": assumed, "files": [str(path) for path in written]}, text)
-    return 0
-
-
-def _check_outputs(args: argparse.Namespace, model: str) -> None:
-    """Raise an `OSError` if a file to write exists without --force, or is an input."""
-    from qsim.calibration.sensor_file import beside, stream_of
-
-    written = beside(args.output)
-    if not (model == "spad" and args.dark):
-        written.pop("dark_count_rate")
-        written.pop("hot_pixels")
-    inputs = [Path(words[0]) for words in [*args.dark, *args.flat, *([args.static] if args.static else [])]]
-    inputs += [path.with_suffix(end) for path in inputs if stream_of(path) is not None for end in (".npy", ".json")]
-    for path in (args.output, *written.values()):
-        places = (path, *path.resolve().parents) if path.exists() else ()
-        for given in inputs:
-            if given.exists() and any(place.samefile(given) for place in places):
-                raise FileExistsError(f"{path}: would replace a file of the input {given}; name another with -o")
-        refuse_existing(path, args.force)
-
+from qsim.cli.command import Idle, command
+from qsim.cli.console import output, refuse_existing
+from qsim.formats.recording import Hints, Layout
+from qsim.kinds import Bits, Planes, Positive
+from qsim.settings import setting
 
 COUNTS = 8  # bits; larger codes of a SPAD may be sums of planes, which the user must state
 
 
-def _calibration_kind(args: argparse.Namespace) -> tuple[str, int]:
-    """Return (qis or spad, bits of a code); `ValueError` for options that exclude each other."""
-    if args.static and (args.dark or args.flat):
-        raise ValueError("--static: a static scene replaces dark and flat frames; leave out --dark and --flat")
-    sums = args.planes is not None and args.planes > 1
-    model = args.model or ("spad" if args.static or args.planes is not None else "qis")
-    for option, given, acts, why in (
-        ("--model qis", args.static and args.model == "qis", False, "--static finds the dead time of a counting SPAD"),
-        (
-            "--planes",
-            args.planes is not None and model == "qis",
-            False,
-            "a QIS is calibrated from its own codes; for sums of binary planes add --model spad",
+@dataclass(frozen=True)
+class Calibrate:
+    """The frames that `qsim calibrate` measures, and what they are; the facts of its files are a `Layout`."""
+
+    output: Annotated[Path, setting(".toml to write; .json and .png beside it", short="o")]
+    dark: Annotated[
+        tuple[tuple[str, ...], ...],
+        setting("frames without light, and their exposure", shown="FILE SECONDS", several="repeated"),
+    ] = ()
+    flat: Annotated[
+        tuple[tuple[str, ...], ...],
+        setting(
+            "evenly lit frames, their exposure, and the photons per pixel if known",
+            shown="FILE SECONDS [PHOTONS]",
+            several="repeated",
         ),
-        ("--planes", sums and args.static, False, "binary planes have no dead time for --static to find"),
-        (
-            "--ignore-dead-time",
-            args.ignore_dead_time,
-            model == "spad" and not args.static,
-            "it is for --model spad with dark and flat frames",
+    ] = ()
+    static: Annotated[
+        tuple[Path, Positive] | None,
+        setting(
+            "counts of a static scene, instead of dark and flat frames: measures the dead time from Fano factors",
+            shown="FILE SECONDS",
+            several="following",
         ),
-        ("--paralyzable", args.paralyzable, model == "spad", "it is for --model spad and --static"),
-        ("--paralyzable", args.paralyzable and args.ignore_dead_time, False, "--ignore-dead-time takes no dead time"),
-        (
-            "--width",
-            args.width is not None and _packed(args) and (sums or args.static is not None),
-            False,
-            "it is for packed binary planes, which are read one by one",
+    ] = None
+    bits: Annotated[
+        Bits | None, setting("bits per code; 1 for binary planes", unset="with --planes of 2 or more: 1")
+    ] = None
+    planes: Annotated[
+        Planes | None,
+        setting(
+            "spad: every value is the sum of this many binary planes, SECONDS and PHOTONS are those of one plane; "
+            "1: values are single exposures"
         ),
-    ):
-        if given and not acts:
-            raise ValueError(f"{option}: {why}; leave it out")
-    if sums and args.bits not in (None, 1):
-        raise ValueError(f"--bits {args.bits}: --planes {args.planes} are 1-bit planes; leave --bits out")
-    if args.bits is None and not sums:
+    ] = None
+    model: Annotated[Literal["qis", "spad"] | None, setting("kind of sensor", unset="qis; spad with --planes")] = None
+    paralyzable: Annotated[bool, setting("spad: every arrival restarts the dead time")] = False
+    ignore_dead_time: Annotated[bool, setting("spad: model the counts as Poisson")] = False
+    force: Annotated[bool, setting("replace existing files")] = False
+
+    @property
+    def kind(self) -> str:
+        """The kind of sensor: as given, else as the frames say."""
+        return self.model or ("spad" if self.static or self.planes is not None else "qis")
+
+    @property
+    def sums(self) -> bool:
+        """Whether every value is the sum of several binary planes."""
+        return self.planes is not None and self.planes > 1
+
+
+def _is_packed(layout: Layout) -> bool:
+    """Return whether --width states the packed planes of .npy files, not the size of raw frames."""
+    return layout.layout in (None, "cube")
+
+
+_NO_DEAD_TIME = "binary planes have no dead time in this model"
+IDLE = (
+    Idle(
+        lambda asked, _: "the static scene of --static replaces dark and flat frames" if asked.static else "",
+        ("dark", "flat"),
+    ),
+    Idle(
+        lambda asked, _: "a qis has no dead time for --static to find" if asked.static and asked.model == "qis" else "",
+        ("model",),
+    ),
+    Idle(
+        lambda asked, _: (
+            "a QIS is calibrated from its own codes; for sums of binary planes add --model spad"
+            if asked.kind == "qis"
+            else ""
+        ),
+        ("planes",),
+    ),
+    Idle(
+        lambda asked, _: "binary planes have no dead time for --static to find" if asked.sums and asked.static else "",
+        ("planes",),
+    ),
+    Idle(
+        lambda asked, _: (
+            "" if asked.kind == "spad" and not asked.static else "it is for --model spad with dark and flat frames"
+        ),
+        ("ignore_dead_time",),
+    ),
+    Idle(lambda asked, _: "" if asked.kind == "spad" else "it is for --model spad and --static", ("paralyzable",)),
+    Idle(lambda asked, _: "--ignore-dead-time takes no dead time" if asked.ignore_dead_time else "", ("paralyzable",)),
+    Idle(
+        lambda asked, _: f"--planes {asked.planes} are 1-bit planes" if asked.sums and asked.bits != 1 else "",
+        ("bits",),
+    ),
+    Idle(lambda asked, _: _NO_DEAD_TIME if asked.sums or asked.bits == 1 else "", ("ignore_dead_time", "paralyzable")),
+    Idle(
+        lambda asked, layout: (
+            "it is for packed binary planes, which are read one by one"
+            if _is_packed(layout) and (asked.sums or asked.static)
+            else ""
+        ),
+        ("width",),
+    ),
+    Idle(
+        lambda asked, layout: (
+            f"it is for packed binary planes, and --bits is {asked.bits}"
+            if _is_packed(layout) and (asked.bits or 1) > 1
+            else ""
+        ),
+        ("width",),
+    ),
+)
+
+
+@command(
+    "qsim calibrate --bits 8 --dark d1.npy 1e-3 --dark d2.npy 0.1 --flat f.npy 1e-3 --flat g.npy 1e-3 -o my.toml",
+    "qsim calibrate --model spad --bits 1 --dark dark.npy 1e-5 --flat flat.npy 1e-5 0.8 -o spad.toml",
+    "qsim calibrate --bits 8 --static counts.npy 6.33e-6 -o counter.toml",
+    idle=IDLE,
+)
+def calibrate(asked: Calibrate, layout: Layout) -> int:
+    """Measure the sensor, write its files and print its numbers."""
+    from qsim.calibration import sensor_file
+    from qsim.calibration.qis import calibrate_qis
+    from qsim.calibration.spad import calibrate_spad
+
+    if asked.output.suffix != ".toml":
+        raise ValueError(f"{asked.output}: the sensor file is a .toml, as in -o my_sensor.toml")
+    model, bits = _calibration_kind(asked)
+    _check_outputs(asked, model)
+    darks = [_stack(words, asked, layout, bits, dark=True) for words in asked.dark]
+    flats = [_stack(words, asked, layout, bits, dark=False) for words in asked.flat]
+    if asked.static:
+        found = _static(asked, layout, bits)
+    elif model == "qis":
+        found = calibrate_qis(darks, flats, bits=bits)
+    else:
+        found = calibrate_spad(
+            darks, flats, bits=bits, dead_time=not asked.ignore_dead_time, paralyzable=asked.paralyzable
+        )
+    asked.output.parent.mkdir(parents=True, exist_ok=True)
+    stacks = f"{len(darks)} dark and {len(flats)} flat stacks"
+    origin = f"counts of the static scene {asked.static[0].name}" if asked.static else stacks
+    written = sensor_file.write(found, asked.output, f"calibrated from {origin}")
+    width = max(len(name) for name in found.values)
+    assumed = _assumed(asked, model, bits)
+    text = [f"taken as: {assumed}"]
+    text += [f"{name:{width}}  {value}  ({value.method})" for name, value in found.values.items()]
+    text += [f"warning: {words}" for words in found.warnings]
+    text += ["written: " + ", ".join(str(path) for path in written)]
+    output(sensor_file.as_dict(found) | {"assumed": assumed, "files": [str(path) for path in written]}, text)
+    return 0
+
+
+def _check_outputs(asked: Calibrate, model: str) -> None:
+    """Raise an `OSError` if a file to write exists without --force, or is an input."""
+    from qsim.calibration.sensor_file import beside, stream_of
+
+    written = beside(asked.output)
+    if not (model == "spad" and asked.dark):
+        written.pop("dark_count_rate")
+        written.pop("hot_pixels")
+    inputs = [Path(words[0]) for words in (*asked.dark, *asked.flat)]
+    inputs += [asked.static[0]] if asked.static else []
+    inputs += [path.with_suffix(end) for path in inputs if stream_of(path) is not None for end in (".npy", ".json")]
+    for path in (asked.output, *written.values()):
+        places = (path, *path.resolve().parents) if path.exists() else ()
+        for given in inputs:
+            if given.exists() and any(place.samefile(given) for place in places):
+                raise FileExistsError(f"{path}: would replace a file of the input {given}; name another with -o")
+        refuse_existing(path, asked.force)
+
+
+def _calibration_kind(asked: Calibrate) -> tuple[str, int]:
+    """Return (qis or spad, bits of a code); `ValueError` if they are not stated."""
+    if asked.bits is None and not asked.sums:
         raise ValueError("--bits: is needed, as in --bits 8; for sums of binary planes give --planes instead")
-    bits = 1 if sums else int(args.bits)
-    if bits == 1:
-        for option, given in (("--ignore-dead-time", args.ignore_dead_time), ("--paralyzable", args.paralyzable)):
-            if given:
-                raise ValueError(f"{option}: binary planes have no dead time in this model; leave it out")
-    if args.width is not None and bits > 1 and _packed(args):
-        raise ValueError(f"--width: it is for packed binary planes, and --bits is {bits}; leave it out")
-    if model == "spad" and bits > COUNTS and args.planes is None and not args.static:
+    bits = asked.bits or 1
+    if asked.kind == "spad" and bits > COUNTS and asked.planes is None and not asked.static:
         raise ValueError(
             f"--bits {bits}: values this large may be sums of binary planes; give --planes N for sums of N planes, or "
             "--planes 1 if every value counts one exposure"
         )
-    return model, bits
+    return asked.kind, bits
 
 
-def _packed(args: argparse.Namespace) -> bool:
-    """Return whether --width states the packed planes of .npy files, not the size of raw frames."""
-    return args.layout in (None, "cube")
-
-
-def _assumed(args: argparse.Namespace, model: str, bits: int) -> str:
+def _assumed(asked: Calibrate, model: str, bits: int) -> str:
     """Return a line that states how the numbers in the files are interpreted."""
-    if args.planes is not None and args.planes > 1:
-        return f"sums of {args.planes} binary planes of a SPAD; seconds and photons are those of one plane"
-    if args.static:
+    if asked.planes is not None and asked.planes > 1:
+        return f"sums of {asked.planes} binary planes of a SPAD; seconds and photons are those of one plane"
+    if asked.static:
         return f"counts of one exposure each, {bits} bits, of a static scene (for sums of planes: --planes)"
     if model == "spad" and bits > 1:
         return f"counts of one exposure each, {bits} bits (for sums of N binary planes: --planes N)"
     return f"{'binary planes of a SPAD' if model == 'spad' else f'{bits}-bit codes of a QIS'}"
 
 
-def _static(args: argparse.Namespace, bits: int) -> Any:
+def _static(asked: Calibrate, layout: Layout, bits: int) -> Any:
     from qsim.calibration.dead_time import calibrate_static
     from qsim.calibration.sensor_file import read_counts
 
-    path = Path(args.static[0])
-    exposure = _number(args.static[1])
-    counts = read_counts(path, hints_of(args, LAYOUT), bits, exposure)
-    return calibrate_static(counts, bits=bits, exposure=exposure, paralyzable=args.paralyzable, name=str(path))
+    assert asked.static is not None
+    path, exposure = asked.static
+    counts = read_counts(path, _hints_of(layout), bits, exposure)
+    return calibrate_static(counts, bits=bits, exposure=exposure, paralyzable=asked.paralyzable, name=str(path))
+
+
+def _hints_of(layout: Layout) -> Hints:
+    """Return the facts of a reader that a layout states."""
+    return Hints(**vars(layout))
 
 
 def _number(word: str) -> float:
@@ -192,7 +230,7 @@ def _number(word: str) -> float:
         raise ValueError(f"{word!r} is not a number; give seconds, as in 1e-3") from None
 
 
-def _stack(words: list[str], args: argparse.Namespace, bits: int, *, dark: bool) -> Any:
+def _stack(words: tuple[str, ...], asked: Calibrate, layout: Layout, bits: int, *, dark: bool) -> Any:
     from qsim.calibration.sensor_file import read_stack
 
     kind, most = ("--dark", 2) if dark else ("--flat", 3)
@@ -207,6 +245,6 @@ def _stack(words: list[str], args: argparse.Namespace, bits: int, *, dark: bool)
         bits=bits,
         exposure=numbers[0],
         photons=photons,
-        hints=hints_of(args, LAYOUT),
-        planes=args.planes if args.planes != 1 else None,
+        hints=_hints_of(layout),
+        planes=asked.planes if asked.planes != 1 else None,
     )

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
-from qsim.cli.console import command, output
-from qsim.cli.options import positive, words
+from qsim.cli.command import command
+from qsim.cli.console import output
+from qsim.kinds import Positive, Text
+from qsim.settings import setting
 from qsim.tables import text_table
 
 if TYPE_CHECKING:
@@ -18,31 +19,31 @@ if TYPE_CHECKING:
 _HEADER = ("stream", "sensor", "bits", "codes", "time [ms]", "photons", "PSNR [dB]", "MB/s")
 
 
-def add_compare(sub: Any) -> None:
-    """Add the command `compare` to a program."""
-    parser = command(
-        sub,
-        "compare",
-        _run_compare,
-        "Compare the streams of a clip: each averaged over the same span of time.",
-        "qsim compare out/readouts/clips/fan_0000\nqsim compare out/fan --streams spike,conventional --span 0.6e-3",
-    )
-    parser.add_argument("clip", type=Path, help="clip folder with streams")
-    parser.add_argument("--streams", type=words, help="names of streams, comma-separated (default: all)")
-    parser.add_argument("--span", type=positive, help="seconds that are averaged (default: the longest code)")
+@dataclass(frozen=True)
+class Compare:
+    """What `qsim compare` compares."""
+
+    clip: Annotated[Path, setting("clip folder with streams", positional=True)]
+    streams: Annotated[tuple[Text, ...], setting("names of streams, comma-separated", unset="all")] = ()
+    span: Annotated[Positive | None, setting("seconds that are averaged", unset="the longest code")] = None
 
 
-def _run_compare(args: argparse.Namespace) -> int:
+@command(
+    "qsim compare out/readouts/clips/fan_0000",
+    "qsim compare out/fan --streams spike,conventional --span 0.6e-3",
+)
+def compare(asked: Compare) -> int:
+    """Print the rows of all readouts of a clip."""
     from qsim.streams.clip import Clip
     from qsim.studies import readouts
 
-    found = readouts.compare(Clip.open(args.clip), args.streams or (), args.span)
+    found = readouts.compare(Clip.open(asked.clip), asked.streams, asked.span)
     lines = text_table([_cells(row) for row in found.rows], _HEADER, left=2)
     head = f"{found.clip}: {len(found.instants)} instants, {found.span * 1e3:.4g} ms each, against the sharp light"
     rows = [asdict(row) for row in found.rows]
     for row in rows:
         row["psnr_db"] = row["psnr_db"] if math.isfinite(row["psnr_db"]) else None  # JSON has no infinity
-    output(args, asdict(found) | {"rows": rows}, [head, *lines, *found.remarks])
+    output(asdict(found) | {"rows": rows}, [head, *lines, *found.remarks])
     return 0
 
 

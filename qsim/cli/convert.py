@@ -2,202 +2,243 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from qsim import files, records
-from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, command, note, output, refuse_idle
-from qsim.cli.options import check_free, count, positive
-from qsim.cli.reader_options import LAYOUT, add_reader_options, hints_of
+from qsim.cli.command import Idle, command
+from qsim.cli.completion import sensors
+from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, note, output, running
+from qsim.cli.options import check_free
 from qsim.clip.source import Times
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
-from qsim.formats.recording import Recording
+from qsim.formats.recording import Hints, Recording
+from qsim.kinds import Positive, Split, Text, Whole
 from qsim.restored_video import describes_restored
+from qsim.settings import setting, settings_of
 from qsim.streams.clip import Clip
 from qsim.streams.stream import Stream
 
 PICTURES = ("mp4", "png", "nerfstudio")  # kinds that show light through a transfer curve
 _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs", ".dat": "spike", ".npz": "photons"}
 
-
-def add_convert(sub: Any) -> None:
-    """Add the command `convert` to a program."""
-    parser = command(
-        sub,
-        "convert",
-        _run_convert,
-        "Read foreign recordings as clips or streams; write ours for others.",
-        "qsim convert ball.npy out/ball --frame-rate 30000 --exposure 20e-6 --transfer linear\n"
-        "qsim convert camera.tif out/camera --frame-rate 1000 --transfer linear --white 4095\n"
-        "qsim convert I2-2000FPS/test out/i2_test --frame-rate 2000 --transfer 'gamma 2.2' --split test\n"
-        "qsim convert capture.bin out/capture --layout swissspad2-half --frame-rate 96800\n"
-        "qsim convert out/starter out/starter_mp4 --to mp4\n"
-        "qsim convert out/starter out/starter.h5 --to pairs\n"
-        "qsim convert out/challenge out/cubes --to challenge\n"
-        "qsim convert out/room out/room_poses --to nerfstudio\n"
-        "qsim convert out/fan/streams/spad.json out/fan_cube.npy",
-    )
-    parser.add_argument("input", type=Path, help="a file, a folder, a clip, a stream (its .npy or .json), a data set")
-    parser.add_argument(
-        "output", type=Path, help="clip folder, stream name, .npy, .mp4 or .zarr, or a folder with --to"
-    )
-    reading = parser.add_argument_group("what a foreign file may not state")
-    add_reader_options(reading, [*LAYOUT, "bits", "transfer", "stretched", "flip", "columns", "black", "keep_gaps"])
-    reading.add_argument("--frame-rate", type=positive, help="frames per second of the capture (not of a video file)")
-    reading.add_argument("--exposure", type=positive, help="seconds of light per frame (default: the full frame time)")
-    reading.add_argument(
-        "--sensor", help="sensor that made the codes, by name or file (default: an ideal binary counter)"
-    )
-    reading.add_argument("--ppp", type=positive, help="light level for which the sensor's gain was set")
-    reading.add_argument("--split", choices=SPLITS, help="split to store in the clips")
-    writing = parser.add_argument_group("writing for others")
-    writing.add_argument(
-        "--to",
-        choices=sorted([*exporting.EXPORTS, "pairs"]),
-        help="kind of the output (default: from the suffix of its name); pairs: codes, truth and flow in one .h5; "
-        "challenge: cubes of colour planes with their truth; nerfstudio: pictures and their poses, transforms.json",
-    )
-    writing.add_argument(
-        "--window",
-        type=count,
-        help=f"pairs: codes in each window (default {pairs.WINDOW}); challenge: planes in each cube (default "
-        f"{challenge.PLANES})",
-    )
-    writing.add_argument(
-        "--lossy", action="store_true", help="write mp4 with FFmpeg's default settings, which lose noise"
-    )
-    add_reader_options(parser, ["white"])
-    parser.add_argument("--force", action="store_true", help="replace an existing output")
+OTHERS = "writing for others"
 
 
-def _run_convert(args: argparse.Namespace) -> int:
-    source = args.input
-    if source.suffix == ".npy" and _is_stream(source.with_suffix(".json")):  # its codes name a stream too
-        source = args.input = source.with_suffix(".json")
-    ours = source.is_dir() and any((source / name).is_file() for name in ("clip.json", "dataset.json"))
-    made = _export(args) if ours or _is_stream(source) else _import(args)
-    output(args, {"made": [str(path) for path, _ in made]}, [f"{path}: {about}" for path, about in made])
-    return 0
+@dataclass(frozen=True)
+class Convert:
+    """What `qsim convert` reads and writes; the facts of its files are `Hints`."""
+
+    input: Annotated[
+        Path, setting("a file, a folder, a clip, a stream (its .npy or .json), a data set", positional=True)
+    ]
+    output: Annotated[
+        Path, setting("clip folder, stream name, .npy, .mp4 or .zarr, or a folder with --to", positional=True)
+    ]
+    frame_rate: Annotated[
+        Positive | None, setting("frames per second of the capture (not of a video file)", section=Hints.SECTION)
+    ] = None
+    exposure: Annotated[
+        Positive | None, setting("seconds of light per frame", unset="the full frame time", section=Hints.SECTION)
+    ] = None
+    sensor: Annotated[
+        Text | None,
+        setting(
+            "sensor that made the codes, by name or file",
+            unset="an ideal binary counter",
+            section=Hints.SECTION,
+            known=sensors,
+        ),
+    ] = None
+    ppp: Annotated[
+        Positive | None, setting("light level for which the sensor's gain was set", section=Hints.SECTION)
+    ] = None
+    split: Annotated[Split | None, setting("split to store in the clips", section=Hints.SECTION)] = None
+    to: Annotated[
+        str | None,
+        setting(
+            "kind of the output; pairs: codes, truth and flow in one .h5; challenge: cubes of colour planes with their "
+            "truth; nerfstudio: pictures and their poses, transforms.json",
+            unset="from the suffix of its name",
+            section=OTHERS,
+            choices=sorted([*exporting.EXPORTS, "pairs"]),
+        ),
+    ] = None
+    window: Annotated[
+        Whole | None,
+        setting(
+            "pairs: codes in each window; challenge: planes in each cube",
+            unset=f"pairs {pairs.WINDOW}, challenge {challenge.PLANES}",
+            section=OTHERS,
+        ),
+    ] = None
+    lossy: Annotated[bool, setting("write mp4 with FFmpeg's default settings, which lose noise", section=OTHERS)] = (
+        False
+    )
+    force: Annotated[bool, setting("replace an existing output")] = False
+
+    @property
+    def source(self) -> Path:
+        """The input; of a stream its description, which the .npy of its codes names too."""
+        beside = self.input.with_suffix(".json")
+        return beside if self.input.suffix == ".npy" and _is_stream(beside) else self.input
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether a clip, a stream or a data set of qsim is written for others."""
+        source = self.source
+        ours = source.is_dir() and any((source / name).is_file() for name in ("clip.json", "dataset.json"))
+        return ours or _is_stream(source)
+
+    @property
+    def kind(self) -> str | None:
+        """The kind of the output; None if neither --to nor its name says it."""
+        return self.to or _SUFFIXES.get(self.output.suffix)
+
+    @property
+    def is_light(self) -> bool:
+        """Whether light is written, not codes."""
+        return self.source.suffix != ".json"
 
 
 def _is_stream(path: Path) -> bool:
     return path.suffix == ".json" and path.is_file() and "ppp_factor" in files.read_json(path)
 
 
-_READING = (
-    *LAYOUT,
-    "frame_rate",
-    "exposure",
-    "bits",
-    "stretched",
-    "columns",
-    "black",
-    "keep_gaps",
-    "sensor",
-    "ppp",
-    "split",
+# ---- What cannot act
+
+
+def _written(asked: Convert, acts: bool) -> str:
+    """Return why an option of writing does not act on this kind of output; empty if it does."""
+    if acts or not asked.is_ours or asked.kind is None:
+        return ""
+    return f"changes nothing in {asked.output}, a {asked.kind} of {'light' if asked.is_light else 'codes'}"
+
+
+_STATED = tuple(one.name for one in settings_of(Hints) if one.name not in ("transfer", "white"))
+IDLE = (
+    Idle(
+        lambda asked, _: f"{asked.input} is ours and states it" if asked.is_ours else "",
+        ("frame_rate", "exposure", "sensor", "ppp", "split", *_STATED),
+    ),
+    Idle(
+        lambda asked, _: (
+            f"{asked.input} is read, not written for others" if asked.input.exists() and not asked.is_ours else ""
+        ),
+        ("to", "lossy", "window"),
+    ),
+    Idle(lambda asked, _: _written(asked, asked.is_light and asked.kind in PICTURES), ("transfer", "white")),
+    Idle(lambda asked, _: _written(asked, asked.kind == "mp4"), ("lossy",)),
+    Idle(lambda asked, _: _written(asked, asked.kind in ("pairs", "challenge")), ("window",)),
 )
 
 
-def _refuse_what_cannot_act(args: argparse.Namespace, kind: str, light: bool) -> None:
-    """Raise `ValueError` for options of writing without effect on this kind of output."""
-    where = f"{args.output}, a {kind} of {'light' if light else 'codes'}"
-    if not (light and kind in PICTURES):
-        refuse_idle(args, where, ["transfer"])
-    if kind != "mp4":
-        refuse_idle(args, where, ["lossy"])
-    if kind not in ("pairs", "challenge"):
-        refuse_idle(args, where, ["window"])
+# ---- The command
 
 
-def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
-    refuse_idle(args, f"{args.input} is ours and states it", _READING)
-    if args.flip != "none":
-        raise ValueError(f"{args.input} is ours and states it: --flip changes nothing here; leave it out")
-    kind = args.to or _SUFFIXES.get(args.output.suffix)
+@command(
+    "qsim convert ball.npy out/ball --frame-rate 30000 --exposure 20e-6 --transfer linear",
+    "qsim convert camera.tif out/camera --frame-rate 1000 --transfer linear --white 4095",
+    "qsim convert I2-2000FPS/test out/i2_test --frame-rate 2000 --transfer 'gamma 2.2' --split test",
+    "qsim convert capture.bin out/capture --layout swissspad2-half --frame-rate 96800",
+    "qsim convert out/starter out/starter_mp4 --to mp4",
+    "qsim convert out/starter out/starter.h5 --to pairs",
+    "qsim convert out/challenge out/cubes --to challenge",
+    "qsim convert out/room out/room_poses --to nerfstudio",
+    "qsim convert out/fan/streams/spad.json out/fan_cube.npy",
+    idle=IDLE,
+)
+def convert(asked: Convert, hints: Hints) -> int:
+    """Import what is foreign, export what is ours, and print what was made."""
+    made = _export(asked, hints) if asked.is_ours else _import(asked, hints)
+    output({"made": [str(path) for path, _ in made]}, [f"{path}: {about}" for path, about in made])
+    return 0
+
+
+def _export(asked: Convert, hints: Hints) -> list[tuple[Path, str]]:
+    kind = asked.kind
+    source = asked.source
     if kind is None:
         known = ", ".join(sorted([*exporting.EXPORTS, "pairs"]))
-        raise ValueError(f"{args.output}: name the kind of output with --to: {known}")
-    _refuse_what_cannot_act(args, kind, args.input.suffix != ".json")
-    planes = args.window or challenge.PLANES
-    wanted = exporting.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy, planes=planes)
-    if args.white is not None and (kind not in PICTURES or args.input.suffix == ".json"):
-        raise ValueError("--white: acts on light written as mp4, png or nerfstudio; leave it out")
+        raise ValueError(f"{asked.output}: name the kind of output with --to: {known}")
+    planes = asked.window or challenge.PLANES
+    wanted = exporting.Export(kind, hints.transfer or "gamma 2.2", hints.white, not asked.lossy, planes=planes)
     if kind == "pairs":
-        return [_pairs(args)]
-    if not (args.input / "dataset.json").is_file():
-        opened = Stream.open(args.input) if args.input.suffix == ".json" else Clip.open(args.input)
-        return [exporting.described(opened, args.output, wanted, force=args.force)]
+        return [_pairs(asked)]
+    if not (source / "dataset.json").is_file():
+        opened = Stream.open(source) if source.suffix == ".json" else Clip.open(source)
+        return [exporting.described(opened, asked.output, wanted, force=asked.force)]
     suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr", "spike": ".dat", "photons": ".npz"}.get(kind, "")
-    check_free(args.output)
-    args.after_interrupt = MAKES_AGAIN
+    check_free(asked.output)
+    running().after_interrupt = MAKES_AGAIN
     made = []
-    clips = Dataset.open(args.input).clips()
+    clips = Dataset.open(source).clips()
     for clip in clips:
         exporting.check(clip, wanted)
     with bar("converting", "clip") as progress:
         for n, clip in enumerate(clips, 1):
-            folder = args.output / (clip.info.split or "all")
+            folder = asked.output / (clip.info.split or "all")
             target = folder / f"{files.check_name(clip.name)}{suffix}"
-            made.append(exporting.described(clip, target, wanted, force=args.force))
+            made.append(exporting.described(clip, target, wanted, force=asked.force))
             progress(n, len(clips))
     return made
 
 
-def _pairs(args: argparse.Namespace) -> tuple[Path, str]:
+def _pairs(asked: Convert) -> tuple[Path, str]:
     """Write the windows of a data set or a clip."""
-    if args.input.suffix == ".json":
-        raise ValueError(f"{args.input}: pairs are made of a data set or a clip, with all its streams; name its folder")
-    if (args.input / "dataset.json").is_file():
-        data = Dataset.open(args.input)
+    if asked.source.suffix == ".json":
+        raise ValueError(
+            f"{asked.source}: pairs are made of a data set or a clip, with all its streams; name its folder"
+        )
+    if (asked.source / "dataset.json").is_file():
+        data = Dataset.open(asked.source)
         splits = {split: data.clips(split) for split in SPLITS}
     else:
-        splits = {"all": [Clip.open(args.input)]}
+        splits = {"all": [Clip.open(asked.source)]}
     with bar("converting", "window") as progress:
-        about = pairs.write(splits, args.output, args.window or pairs.WINDOW, force=args.force, progress=progress)
-    return args.output, about
+        about = pairs.write(splits, asked.output, asked.window or pairs.WINDOW, force=asked.force, progress=progress)
+    return asked.output, about
 
 
-def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
-    refuse_idle(args, f"{args.input} is read, not written for others", ["to", "lossy", "window"])
-    restored = _restored(args.input)
-    args.frame_rate = args.frame_rate or restored.get("frame_rate")
-    args.exposure = args.exposure or restored.get("exposure")
-    args.transfer = args.transfer or ("linear" if restored else None)
-    hints = hints_of(args)
-    found = detection.recordings(args.input, args.layout)
-    if args.layout is None:
-        detection.check_one_kind(args.input, found)
-    pairs = [(source, args.output / files.check_name(_flat_name(source, args.input))) for source in found]
+def _import(asked: Convert, hints: Hints) -> list[tuple[Path, str]]:
+    restored = _restored(asked.input)
+    frame_rate = asked.frame_rate or restored.get("frame_rate")
+    exposure = asked.exposure or restored.get("exposure")
+    if restored and hints.transfer is None:
+        hints = replace(hints, transfer="linear")
+    found = detection.recordings(asked.input, hints.layout)
+    if hints.layout is None:
+        detection.check_one_kind(asked.input, found)
+    pairs = [(source, asked.output / files.check_name(_flat_name(source, asked.input))) for source in found]
     if pairs:
-        _check_names(args.input, pairs)
-        check_free(args.output)
-        args.after_interrupt = MAKES_AGAIN
+        _check_names(asked.input, pairs)
+        check_free(asked.output)
+        running().after_interrupt = MAKES_AGAIN
     made = []
     with bar("converting") as progress:
-        for source, target in pairs or [(args.input, args.output)]:
+        for source, target in pairs or [(asked.input, asked.output)]:
             recording = importing.read(source, hints)
-            rate = args.frame_rate or recording.frame_rate
+            rate = frame_rate or recording.frame_rate
             if rate is None:
-                raise ValueError(f"{args.input}: files do not state the capture rate; add --frame-rate, as in 2000")
-            capture = importing.Import(rate, args.exposure, args.sensor, args.ppp, args.split)
+                raise ValueError(f"{asked.input}: files do not state the capture rate; add --frame-rate, as in 2000")
+            capture = importing.Import(rate, exposure, asked.sensor, asked.ppp, asked.split)
             if recording.is_light:
                 if target.suffix in _SUFFIXES:
                     raise ValueError(
                         f"{target}: light is read into a clip, a folder; name it without {target.suffix}, or write a "
                         "film with `qsim preview`"
                     )
-                args.after_interrupt = args.after_interrupt if pairs else RESUMES
-                clip = importing.to_clip(recording, target, capture, force=args.force, progress=progress)
+                running().after_interrupt = MAKES_AGAIN if pairs else RESUMES
+                clip = importing.to_clip(recording, target, capture, force=asked.force, progress=progress)
                 made.append(
                     (clip.path, f"{_size(clip)}, light of {recording.format}; {importing.saturation_line(clip)}")
                 )
                 _tell_reading(source, recording)
                 continue
-            stream = importing.to_stream(recording, target, capture, force=args.force, progress=progress)
+            stream = importing.to_stream(recording, target, capture, force=asked.force, progress=progress)
             made.append((stream.path, f"{_size(stream)}, {stream.bits}-bit codes, {recording.format}"))
             _tell_reading(source, recording)
     return made

@@ -6,22 +6,24 @@ are in the package (qsim/measurements/, with their licences).
 
 from __future__ import annotations
 
-import argparse
 import io
 import json
 import shlex
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
-from qsim.cli.console import OPTIONAL, RESUMES, command, failed, output
+from qsim.cli.command import command
+from qsim.cli.console import OPTIONAL, RESUMES, failed, output, running
 from qsim.cli.options import check_free
 from qsim.files import to_json, write_bytes, write_json
+from qsim.settings import setting
 from qsim.terminal import is_lost, printable
 
 MEASUREMENTS = Path(__file__).parents[1] / "measurements"
@@ -33,40 +35,38 @@ NETWORK = "mergenet"  # also the name of the weights that ship with the package
 METHODS = ("naive:1", "naive:11", "moment:3", "qbp-bm3d", NETWORK)
 
 
-def add_demo(sub: Any) -> None:
-    """Add the command `demo` to a program."""
-    parser = command(
-        sub,
-        "demo",
-        _run_demo,
-        "Render, sense, train, restore and score small scenes; write one page of the results.",
-        "qsim demo\nqsim demo out/demo",
-        RESUMES,
-    )
-    parser.add_argument("folder", type=Path, nargs="?", default=Path("out/demo"), help="to fill (default out/demo)")
+@dataclass(frozen=True)
+class Demo:
+    """Where `qsim demo` writes."""
+
+    folder: Annotated[Path, setting("to fill", positional=True)] = Path("out/demo")
 
 
-def _run_demo(args: argparse.Namespace) -> int:
+@command("qsim demo", "qsim demo out/demo", after_interrupt=RESUMES)
+def demo(asked: Demo) -> int:
+    """Run all steps; the same command resumes after a failure or Ctrl-C."""
     from qsim.process import peak_memory_of_children
 
-    check_free(args.folder)
+    check_free(asked.folder)
     for package in OPTIONAL["networks"][0]:
         if not find_spec(package):
             raise ModuleNotFoundError(f"No module named {package!r}", name=package)
     started = time.perf_counter()
-    out = args.folder
+    out = asked.folder
     claim(out)
     try:
-        steps(out, args.quiet or args.json)
+        steps(out, running().silent)
     except subprocess.CalledProcessError as error:
         step = shlex.join(error.cmd[2:])
         again = shlex.join(["qsim", "demo", str(out)])
-        return failed(f"qsim demo: stopped at '{step}'; `{again}` resumes there", error.returncode, args.json)
+        return failed(
+            f"qsim demo: stopped at '{step}'; `{again}` resumes there", error.returncode, running().printing.json
+        )
     minutes = (time.perf_counter() - started) / 60
     peak = peak_memory_of_children()
     page = out / "index.html"
     facts = {"page": str(page), "minutes": minutes, "largest_process_bytes": peak}
-    output(args, facts, f"\ndemo: {minutes:.1f} minutes, largest process {peak / 2**30:.2f} GB; open {page}")
+    output(facts, f"\ndemo: {minutes:.1f} minutes, largest process {peak / 2**30:.2f} GB; open {page}")
     return 0
 
 

@@ -2,89 +2,86 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import os
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
-from qsim import checks, records
+from qsim import records
 from qsim.backend import BACKENDS
-from qsim.cli.console import PILOT, RESUMES, bar, command, output, refuse_idle
-from qsim.cli.options import checked
+from qsim.cli.command import Idle, command
+from qsim.cli.completion import families
+from qsim.cli.console import PILOT, RESUMES, bar, output
+from qsim.kinds import FrameRate, Frames, Positive, Psnr, Seed, Shutter, Speed
+from qsim.settings import setting
 
-LIGHT = (
-    "highest light level you will sense, photons per pixel; sets samples so that the Monte-Carlo variance stays "
-    "below 1 %% of the shot variance"
+
+@dataclass(frozen=True)
+class Render:
+    """The clip that `qsim render` makes."""
+
+    scene: Annotated[
+        str,
+        setting(
+            "a family of scenes/, a .py file with scene(seed, speed=...), an animated .glb, Mitsuba .xml, a folder",
+            positional=True,
+            known=families,
+        ),
+    ]
+    output: Annotated[Path | None, setting("clip folder to make (may be left out with --explain)", short="o")] = None
+    explain: Annotated[bool, setting("print the modelled effects, and the size of the omitted ones")] = False
+    seed: Annotated[Seed, setting("seed of the scene and its samples")] = 0
+    speed: Annotated[Speed, setting("factor on all motions")] = 1.0
+    frames: Annotated[Frames, setting("number of frames")] = 21
+    height: Annotated[Frames | None, setting("pixels", unset="128; of a Mitsuba file its film's")] = None
+    width: Annotated[Frames | None, setting("pixels", unset="128; of a Mitsuba file its film's")] = None
+    frame_rate: Annotated[FrameRate, setting("frames per second")] = 2000.0
+    shutter: Annotated[Shutter, setting("open fraction of a frame, 0..1", unset="0: sharp")] = 0.0
+    psnr: Annotated[Psnr, setting("requested error of the radiance, in dB below white and clamped at white")] = 40.0
+    bands: Annotated[Literal["rgb"] | None, setting("rgb: in colour, three bands", unset="one band")] = None
+    camera_path: Annotated[
+        Path | None,
+        setting(
+            "transforms.json whose poses, view and distortion the camera has",
+            unset="the camera of the scene",
+            shown="FILE",
+        ),
+    ] = None
+    ppp: Annotated[
+        Positive | None,
+        setting(
+            "highest light level you will sense, photons per pixel; sets samples so that the Monte-Carlo variance "
+            "stays below 1 % of the shot variance"
+        ),
+    ] = None
+    reuse: Annotated[
+        bool | None,
+        setting(
+            "let sharp frames share samples with their neighbours, or render each frame alone",
+            unset="share where that costs less, and trying it costs little against the clip",
+        ),
+    ] = None
+    engine: Annotated[str | None, setting("engine to use", unset="QSIM_ENGINE, else the fastest", choices=BACKENDS)] = (
+        None
+    )
+    force: Annotated[bool, setting("replace an existing clip")] = False
+
+
+@command(
+    "qsim render fan -o out/fan --frames 21 --height 128 --width 128",
+    "qsim render fan --explain",
+    after_interrupt=RESUMES,
+    threads="threads of the renderer (Dr.Jit); the picture does not depend on it",
+    idle=[Idle(lambda asked: "" if asked.output else "replaces the clip of --output", ("force",))],
 )
-
-
-def add_render(sub: Any) -> None:
-    """Add the command `render` to a program."""
-    parser = command(
-        sub,
-        "render",
-        _run_render,
-        "Render a scene into a clip: radiance, sharp frames, flow, depth, body ids.",
-        "qsim render fan -o out/fan --frames 21 --height 128 --width 128\nqsim render fan --explain",
-        RESUMES,
-        threads="threads of the renderer (Dr.Jit); the picture does not depend on it",
-    )
-    parser.add_argument(
-        "scene",
-        help="a family of scenes/, a .py file with scene(seed, speed=...), an animated .glb, Mitsuba .xml, a folder",
-    )
-    parser.add_argument("-o", "--output", type=Path, help="clip folder to make (may be left out with --explain)")
-    parser.add_argument(
-        "--explain", action="store_true", help="print the modelled effects, and the size of the omitted ones"
-    )
-    whole = checked(checks.whole)
-    parser.add_argument(
-        "--seed", type=checked(checks.seed), default=0, help="seed of the scene and its samples (default 0)"
-    )
-    parser.add_argument("--speed", type=checked(checks.speed), default=1.0, help="factor on all motions (default 1)")
-    parser.add_argument("--frames", type=whole, default=21, help="number of frames (default 21)")
-    parser.add_argument("--height", type=whole, help="pixels (default 128; of a Mitsuba file its film's)")
-    parser.add_argument("--width", type=whole, help="pixels (default 128; of a Mitsuba file its film's)")
-    rate, shutter, psnr = (checked(check) for check in (checks.frame_rate, checks.shutter, checks.psnr))
-    parser.add_argument("--frame-rate", type=rate, default=2000.0, help="frames per second (default 2000)")
-    parser.add_argument(
-        "--shutter", type=shutter, default=0.0, help="open fraction of a frame, 0..1 (default 0: sharp)"
-    )
-    parser.add_argument(
-        "--psnr",
-        type=psnr,
-        default=40.0,
-        help="requested error of the radiance, in dB below white and clamped at white (default 40)",
-    )
-    parser.add_argument("--bands", choices=["rgb"], help="rgb: in colour, three bands (default: one band)")
-    parser.add_argument(
-        "--camera-path",
-        type=Path,
-        metavar="FILE",
-        help="transforms.json whose poses, view and distortion the camera has (default: the camera of the scene)",
-    )
-    light = checked(checks.positive)
-    parser.add_argument("--ppp", type=light, help=LIGHT)
-    sharing = parser.add_mutually_exclusive_group()
-    sharing.add_argument(
-        "--reuse",
-        action="store_true",
-        default=None,
-        help="let sharp frames share samples with their neighbours where that costs less (default: where trying it "
-        "costs little against the clip)",
-    )
-    sharing.add_argument("--no-reuse", dest="reuse", action="store_false", default=None, help="render each frame alone")
-    parser.add_argument("--engine", choices=BACKENDS, help="engine to use (default: QSIM_ENGINE, else the fastest)")
-    parser.add_argument("--force", action="store_true", help="replace an existing clip")
-
-
-def _run_render(args: argparse.Namespace) -> int:
+def render(asked: Render) -> int:
+    """Render the clip and print its error, or explain the samples that it takes."""
     from qsim import backend, scenes
     from qsim.clip.clamped_error import stated
     from qsim.clip.exr import HALF_MAX
-    from qsim.dataset.scene_rendering import load_scene, render
+    from qsim.dataset import scene_rendering
     from qsim.optics.diffraction import diffraction_line
     from qsim.rendering.budget import explain
     from qsim.rendering.fidelity import choose_budget, shortfall
@@ -92,24 +89,22 @@ def _run_render(args: argparse.Namespace) -> int:
     from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
     from qsim.scenes.gltf_file import played
 
-    if args.output is None and not args.explain:
+    if asked.output is None and not asked.explain:
         raise ValueError("-o/--output is required (optional only with --explain)")
-    if args.output is None:
-        refuse_idle(args, "render without --output", ["force"])
-    if args.output is not None and args.output.exists() and not args.force:
-        raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
-    if args.engine is not None:
-        os.environ["QSIM_ENGINE"] = args.engine
+    if asked.output is not None and asked.output.exists() and not asked.force:
+        raise FileExistsError(f"{asked.output}: exists; name another with -o, or use --force to replace it")
+    if asked.engine is not None:
+        os.environ["QSIM_ENGINE"] = asked.engine
         backend.choose()
-    taken = {name: getattr(args, name) for name in ("frames", "seed", "frame_rate", "shutter", "psnr", "ppp", "reuse")}
-    size = {name: getattr(args, name) for name in ("height", "width", "speed", "bands", "camera_path")}
-    if args.output is None:
-        scene, _ = load_scene(args.scene, **size, seed=args.seed, frame_rate=args.frame_rate)
+    taken = {name: getattr(asked, name) for name in ("frames", "seed", "frame_rate", "shutter", "psnr", "ppp", "reuse")}
+    size = {name: getattr(asked, name) for name in ("height", "width", "speed", "bands", "camera_path")}
+    if asked.output is None:
+        scene, _ = scene_rendering.load_scene(asked.scene, **size, seed=asked.seed, frame_rate=asked.frame_rate)
         chosen = choose_budget(scene, **taken)
-        output(args, {"render": dataclasses.asdict(chosen)}, explain(chosen.findings))
+        output({"render": dataclasses.asdict(chosen)}, explain(chosen.findings))
         return 0
-    with bar(args.output.name, first=PILOT) as progress:
-        clip = render(args.scene, args.output, **taken, **size, progress=progress, force=args.force)
+    with bar(asked.output.name, first=PILOT) as progress:
+        clip = scene_rendering.render(asked.scene, asked.output, **taken, **size, progress=progress, force=asked.force)
     info = clip.info
     work = info.render
     assert work is not None
@@ -117,10 +112,10 @@ def _run_render(args: argparse.Namespace) -> int:
     text = f"{clip.path}: {len(clip)} frames of {clip.shape[1]} x {clip.shape[2]}"
     text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
     text += f", {clip.mean_photons:.4g} photons per pixel"
-    if args.scene.endswith(GLTF_SUFFIXES):
-        text += f"\n{played(scenes.load(args.scene, args.seed, args.speed))}"
+    if asked.scene.endswith(GLTF_SUFFIXES):
+        text += f"\n{played(scenes.load(asked.scene, asked.seed, asked.speed))}"
     text += "" if found is None else f"\nerror: {found.line}"
-    text += (missed := shortfall(found, args.psnr)) and f"\nerror: {missed}"
+    text += (missed := shortfall(found, asked.psnr)) and f"\nerror: {missed}"
     if info.fireflies_per_frame:
         fireflies = sum(info.fireflies_per_frame)
         pixels = math.prod(clip.shape)
@@ -133,13 +128,13 @@ def _run_render(args: argparse.Namespace) -> int:
             if info.saturated_pixels is not None
             else ": cut off there"
         )
-    if not args.explain and (args.reuse or work.neighbours):
+    if not asked.explain and (asked.reuse or work.neighbours):
         text += "".join(f"\n{explain([one])}" for one in work.findings if one.effect == REUSE)
-    if args.explain or clip.camera is None:
+    if asked.explain or clip.camera is None:
         text += "\n" + explain(work.findings)
     else:
         text += "\n" + diffraction_line(clip.camera, clip.bands)
     facts = records.plain(info, complete=True)
     del facts["checksums"]
-    output(args, {"clip": str(clip.path)} | facts, text)
+    output({"clip": str(clip.path)} | facts, text)
     return 0

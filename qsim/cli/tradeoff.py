@@ -2,117 +2,185 @@
 
 from __future__ import annotations
 
-import argparse
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from qsim import checks, files
-from qsim.cli.console import MAKES_AGAIN, PILOT, RESUMES, bar, command, note, output, refuse_existing, refuse_idle
-from qsim.cli.options import check_free, checked, count, frame_size, positive, steps, whole_numbers
+from qsim import files
+from qsim.cli.command import Idle, command
+from qsim.cli.completion import families, sensors
+from qsim.cli.console import MAKES_AGAIN, PILOT, RESUMES, bar, note, output, refuse_existing, running
+from qsim.cli.options import check_free
 from qsim.files import Progress
+from qsim.kinds import Bits, Frames, NotNegative, Number, Positive, Seed, Whole
+from qsim.settings import setting
 from qsim.time_forecast import TimeForecast
+from qsim.words import frame_size, steps
+
+_SENSORS = "a name of `qsim doctor --devices`, or a file of a SPAD or of a QIS with gain 1, whatever its bits"
 
 
-def add_tradeoff(sub: Any) -> None:
-    """Add the command `tradeoff` to a program."""
-    parser = command(
-        sub,
-        "tradeoff",
-        _run_tradeoff,
-        "Bit depth against motion, light, read noise and data rate.",
-        "qsim tradeoff --table --size 240x320 --base-fps 10000 --read-noise 0.2 --bits 1,3,5,7,9\n"
-        "qsim tradeoff out/fast --ppp 0.65 -o out/bits\n"
-        "qsim tradeoff fan --px 3 --ppp 2 -o out/fan_3px\n"
-        "qsim tradeoff fan --speed 0.5:8 --ppp 0.1:30 -o out/sweep\n"
-        "qsim tradeoff --paper-figure 1 -o out/figure1",
-        RESUMES,
-        threads="threads of the compiled engine (Dr.Jit)",
-    )
-    parser.add_argument("source", nargs="?", help="a clip of at least 10000 fps, or a scene (rendered into -o)")
-    parser.add_argument(
-        "--table", action="store_true", help="print the table of bit depths only, computed without a clip"
-    )
-    parser.add_argument("--paper-figure", type=int, choices=(1, 2), help="draw a figure of the QUIVER paper")
-    parser.add_argument("--size", type=frame_size, help="ROWSxCOLUMNS (default 240x320, rendered scenes 96x128)")
-    parser.add_argument("--base-fps", type=positive, help="planes per second (default 10000; a clip has its own)")
-    parser.add_argument("--read-noise", type=float, help="table: e- rms per read (default 0.2)")
-    bits = "comma-separated (default 1,2,3,4,5, then up to 7 while the deepest is best; table 1,3,5,7,9)"
-    parser.add_argument("--bits", type=whole_numbers, help=bits)
-    parser.add_argument("--motion", type=float, help="table: image speed, px/s (default 2500)")
-    parser.add_argument("--ppp", type=steps, help="photons per pixel and plane: 0.65 or 0.1,1,10 or 0.1:30 (6 steps)")
-    moving = parser.add_mutually_exclusive_group()
-    moving.add_argument(
-        "--speed", type=steps, help="factors on the motion, listed as in --ppp (default 1; of a clip: whole factors)"
-    )
-    px = (
-        "motion of the moving pixels, px per 3-bit frame of 7 planes, listed as in --ppp; sets the speed, and the "
-        "moving pixels alone are scored"
-    )
-    moving.add_argument("--px", type=steps, help=px)
-    files_of = "a name of `qsim doctor --devices`, or a file of a SPAD or of a QIS with gain 1, whatever its bits"
-    parser.add_argument(
-        "--sensor",
-        help=f"sensor of the multi-bit read (default quiver-physical): {files_of}; another QIS file at its own --bits",
-    )
-    parser.add_argument(
-        "--plane-sensor",
-        help=f"sensor of a binary plane (default: a clocked SPAD of the same efficiency): {files_of}; another QIS file "
-        "if it has 1 bit",
-    )
-    parser.add_argument(
-        "--temperature", type=float, help="degrees C of sensor files with dark_doubling (default: the file's own)"
-    )
-    parser.add_argument("--instants", type=count, help="frames drawn and scored per depth (default 8)")
-    parser.add_argument("--frames", type=count, help="frames of a rendered scene (default: enough for the instants)")
-    seed = checked(checks.seed)
-    parser.add_argument("--seed", type=seed, help="seed of the noise and of a rendered scene (default 0)")
-    parser.add_argument("--streams", action="store_true", help="write clips and streams of each depth, for restorers")
-    parser.add_argument("-o", "--output", type=Path, help="folder for numbers, figures, clips")
-    parser.add_argument("--force", action="store_true", help="replace existing numbers, figures and streams")
+@dataclass(frozen=True)
+class Tradeoff:
+    """The study, table or figure that `qsim tradeoff` makes."""
+
+    source: Annotated[
+        str | None,
+        setting("a clip of at least 10000 fps, or a scene (rendered into -o)", positional=True, known=families),
+    ] = None
+    table: Annotated[bool, setting("print the table of bit depths only, computed without a clip")] = False
+    paper_figure: Annotated[Literal[1, 2] | None, setting("draw a figure of the QUIVER paper")] = None
+    size: Annotated[
+        tuple[int, int] | None,
+        setting("ROWSxCOLUMNS", unset="240x320, rendered scenes 96x128", read=frame_size),
+    ] = None
+    base_fps: Annotated[Positive | None, setting("planes per second", unset="10000; a clip has its own")] = None
+    read_noise: Annotated[NotNegative | None, setting("table: e- rms per read", unset="0.2")] = None
+    bits: Annotated[
+        tuple[Bits, ...] | None,
+        setting("comma-separated", unset="1,2,3,4,5, then up to 7 while the deepest is best; table 1,3,5,7,9"),
+    ] = None
+    motion: Annotated[Number | None, setting("table: image speed, px/s", unset="2500")] = None
+    ppp: Annotated[
+        list[float] | None,
+        setting("photons per pixel and plane: 0.65 or 0.1,1,10 or 0.1:30 (6 steps)", read=steps),
+    ] = None
+    speed: Annotated[
+        list[float] | None,
+        setting("factors on the motion, listed as in --ppp", unset="1; of a clip: whole factors", read=steps),
+    ] = None
+    px: Annotated[
+        list[float] | None,
+        setting(
+            "motion of the moving pixels, px per 3-bit frame of 7 planes, listed as in --ppp; sets the speed, and the "
+            "moving pixels alone are scored",
+            read=steps,
+        ),
+    ] = None
+    sensor: Annotated[
+        str | None,
+        setting(
+            f"sensor of the multi-bit read: {_SENSORS}; another QIS file at its own --bits",
+            unset="quiver-physical",
+            known=sensors,
+        ),
+    ] = None
+    plane_sensor: Annotated[
+        str | None,
+        setting(
+            f"sensor of a binary plane: {_SENSORS}; another QIS file if it has 1 bit",
+            unset="a clocked SPAD of the same efficiency",
+            known=sensors,
+        ),
+    ] = None
+    temperature: Annotated[
+        Number | None, setting("degrees C of sensor files with dark_doubling", unset="the file's own")
+    ] = None
+    instants: Annotated[Whole | None, setting("frames drawn and scored per depth", unset="8")] = None
+    frames: Annotated[Frames | None, setting("frames of a rendered scene", unset="enough for the instants")] = None
+    seed: Annotated[Seed | None, setting("seed of the noise and of a rendered scene", unset="0")] = None
+    streams: Annotated[bool, setting("write clips and streams of each depth, for restorers")] = False
+    output: Annotated[Path | None, setting("folder for numbers, figures, clips", short="o")] = None
+    force: Annotated[bool, setting("replace existing numbers, figures and streams")] = False
+
+    @property
+    def of_clip(self) -> bool:
+        """Whether a stored clip is studied, not a scene."""
+        return self.source is not None and (Path(self.source) / "clip.json").is_file()
+
+    @property
+    def named(self) -> str:
+        """The clip or scene."""
+        assert self.source is not None  # checked by the command
+        return self.source
+
+    @property
+    def draws(self) -> int:
+        """The seed."""
+        return self.seed or 0
+
+    @property
+    def folder(self) -> Path:
+        """The folder of results; a study without one renders nothing."""
+        assert self.output is not None
+        return self.output
 
 
-TABLE_ONLY = ("read_noise", "motion")
 OF_STUDIES = ("px", "ppp", "bits", "base_fps", "sensor", "plane_sensor", "temperature", "instants", "frames", "streams")
 PICTURES = {"tradeoff": ("best.png", "tradeoff.png")}  # of a study: which of them depends on its size
 OF_FILES = ("seed", "speed", "output", "force")
+_OF_TABLE = (
+    "paper_figure",
+    *(name for name in OF_STUDIES if name not in ("bits", "base_fps")),
+    *OF_FILES,
+    "threads",
+)
 
 
-def _run_tradeoff(args: argparse.Namespace) -> int:
-    if args.table:
-        if args.source is not None:
-            raise ValueError(f"{args.source}: --table is computed without a clip; leave the clip or scene out")
-        idle = [name for name in OF_STUDIES if name not in ("bits", "base_fps")]
-        refuse_idle(args, "tradeoff --table", ["paper_figure", *idle, *OF_FILES, "threads"])
-        return _tradeoff_table(args)
-    name = "tradeoff" if args.paper_figure is None else f"figure{args.paper_figure}"
-    if args.paper_figure is not None:
-        refuse_idle(args, "tradeoff --paper-figure", [*TABLE_ONLY, *OF_STUDIES])
-    elif args.source is None:
+def _without_output(asked: Tradeoff) -> str:
+    return "" if asked.output or asked.streams or asked.paper_figure else "replaces files of --output"
+
+
+IDLE = (
+    Idle(lambda asked: "changes nothing in `tradeoff --table`" if asked.table else "", _OF_TABLE),
+    Idle(lambda asked: "sets the speed of the motion, and so does --speed" if asked.speed else "", ("px",)),
+    Idle(
+        lambda asked: "changes nothing in `tradeoff --paper-figure`" if asked.paper_figure else "",
+        ("motion", "read_noise", *OF_STUDIES),
+    ),
+    Idle(
+        lambda asked: (
+            ""
+            if asked.table
+            else "is of --table; a clip or scene is seen by a sensor, so state it in a sensor file (read_noise in "
+            "[sensor]) and give that with --sensor"
+        ),
+        ("read_noise",),
+    ),
+    Idle(lambda asked: "" if asked.table else "changes nothing in `tradeoff` of a clip or scene", ("motion",)),
+    Idle(
+        lambda asked: "changes nothing in `tradeoff` of a clip" if asked.of_clip else "", ("size", "base_fps", "frames")
+    ),
+    Idle(
+        lambda asked: (
+            "changes nothing in `tradeoff --paper-figure` of a clip" if asked.of_clip and asked.paper_figure else ""
+        ),
+        ("speed",),
+    ),
+    Idle(_without_output, ("force",)),
+)
+
+
+@command(
+    "qsim tradeoff --table --size 240x320 --base-fps 10000 --read-noise 0.2 --bits 1,3,5,7,9",
+    "qsim tradeoff out/fast --ppp 0.65 -o out/bits",
+    "qsim tradeoff fan --px 3 --ppp 2 -o out/fan_3px",
+    "qsim tradeoff fan --speed 0.5:8 --ppp 0.1:30 -o out/sweep",
+    "qsim tradeoff --paper-figure 1 -o out/figure1",
+    after_interrupt=RESUMES,
+    threads="threads of the compiled engine (Dr.Jit)",
+    idle=IDLE,
+)
+def tradeoff(asked: Tradeoff) -> int:
+    """Print the table, or make the study or the figure."""
+    if asked.table:
+        if asked.source is not None:
+            raise ValueError(f"{asked.source}: --table is computed without a clip; leave the clip or scene out")
+        return _tradeoff_table(asked)
+    name = "tradeoff" if asked.paper_figure is None else f"figure{asked.paper_figure}"
+    if asked.paper_figure is None and asked.source is None:
         raise ValueError("give a clip or a scene, --table, or --paper-figure; see qsim tradeoff --help")
-    if args.read_noise is not None:
-        raise ValueError(
-            f"--read-noise {args.read_noise:g}: is of --table; a clip or scene is seen by a sensor, so state it in a "
-            "sensor file (read_noise in [sensor]) and give that with --sensor"
-        )
-    refuse_idle(args, "tradeoff of a clip or scene", TABLE_ONLY)
-    if args.source is not None and (Path(args.source) / "clip.json").is_file():
-        refuse_idle(args, "tradeoff of a clip", ["size", "base_fps", "frames"])
-        if args.paper_figure is not None:
-            refuse_idle(args, "tradeoff --paper-figure of a clip", ["speed"])
-    if args.output is None:
-        if args.streams or args.paper_figure:
+    if asked.output is None:
+        if asked.streams or asked.paper_figure:
             raise ValueError("give a folder with -o, as in -o out/bits")
-        refuse_idle(args, "tradeoff without --output", ["force"])
     else:
-        check_free(args.output)
+        check_free(asked.output)
         for written in (f"{name}.json", *PICTURES.get(name, (f"{name}.png",))):
-            refuse_existing(args.output / written, args.force)
-    args.seed = args.seed or 0
-    return _tradeoff_study(args) if args.paper_figure is None else _paper_figure(args)
+            refuse_existing(asked.output / written, asked.force)
+    return _tradeoff_study(asked) if asked.paper_figure is None else _paper_figure(asked)
 
 
-def _tradeoff_study(args: argparse.Namespace) -> int:
+def _tradeoff_study(asked: Tradeoff) -> int:
     from qsim.clip.motion_statistics import SLOWEST
     from qsim.studies.bit_depth import clips as study_clips
     from qsim.studies.bit_depth import figures, speed_sweep
@@ -120,45 +188,45 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     from qsim.studies.bit_depth.clip_study import study
     from qsim.studies.bit_depth.readout import StudySettings
 
-    bits = tuple(args.bits or (1, 2, 3, 4, 5))
-    instants = 8 if args.instants is None else args.instants
-    sensor = args.sensor or "quiver-physical"
+    bits = tuple(asked.bits or (1, 2, 3, 4, 5))
+    instants = 8 if asked.instants is None else asked.instants
+    sensor = asked.sensor or "quiver-physical"
     settings = StudySettings(
-        bits, sensor, args.plane_sensor, None, 1, instants, args.seed, bool(args.px), args.temperature
+        bits, sensor, asked.plane_sensor, None, 1, instants, asked.draws, bool(asked.px), asked.temperature
     )
-    study_clips.check_sensors(settings, args.streams)  # before anything is rendered
-    height, width = args.size or (96, 128)
-    widen = args.bits is None
-    frames = args.frames or (2**WIDEST - 1 if widen else max(4 * settings.longest, 32))
-    rate = 10_000.0 if args.base_fps is None else args.base_fps
-    if not (Path(args.source) / "clip.json").is_file():  # refused before anything is rendered
+    study_clips.check_sensors(settings, asked.streams)  # before anything is rendered
+    height, width = asked.size or (96, 128)
+    widen = asked.bits is None
+    frames = asked.frames or (2**WIDEST - 1 if widen else max(4 * settings.longest, 32))
+    rate = 10_000.0 if asked.base_fps is None else asked.base_fps
+    if not (Path(asked.named) / "clip.json").is_file():  # refused before anything is rendered
         if rate < SLOWEST:
             raise ValueError(f"--base-fps {rate:g}: this study needs at least {SLOWEST:g} planes per second")
         if frames < settings.longest:
             raise ValueError(f"--frames {frames}: {max(bits)} bits need {settings.longest}; give more, or fewer bits")
-    shape = study_clips.ClipShape(frames, height, width, rate, seed=args.seed)
-    speeds = _speeds(args, shape)
-    levels = args.ppp or [None]
+    shape = study_clips.ClipShape(frames, height, width, rate, seed=asked.draws)
+    speeds = _speeds(asked, shape)
+    levels: list[float | None] = [*asked.ppp] if asked.ppp else [None]
     swept = len(speeds) * len(levels) > 1
-    if args.streams and swept:
+    if asked.streams and swept:
         raise ValueError("--streams: writes one speed and one light level; give one --ppp and one --speed or --px")
-    missing = study_clips.to_render(args.source, speeds, args.output)
+    missing = study_clips.to_render(asked.named, speeds, asked.output)
     rendering = TimeForecast(f"rendering {_clips(missing)} of {shape.frames} frames", note, unit="frame", parts=missing)
     with bar("rendering", first=PILOT if missing else "") as shown:
         progress = _both(shown, rendering)
-        clips = list(study_clips.clips_for(args.source, speeds, shape, args.output, progress))
+        clips = list(study_clips.clips_for(asked.named, speeds, shape, asked.output, progress))
     first = clips[0].clip
-    if args.streams and clips[0].step > 1:
+    if asked.streams and clips[0].step > 1:
         raise ValueError("--streams: writes a clip at its own speed; leave out --speed and --px, or name a scene")
-    if first.camera is None and not args.ppp:
+    if first.camera is None and not asked.ppp:
         raise ValueError(f"{first.path}: its radiance is relative; give the light with --ppp, as in --ppp 0.65")
-    if args.streams:  # refused before the study, not after it
+    if asked.streams:  # refused before the study, not after it
         for depth in range(1, WIDEST + 1) if widen else settings.bits:
-            study_clips.stream_clip(first, args.output / "streams", depth, args.force)
+            study_clips.stream_clip(first, asked.folder / "streams", depth, asked.force)
     text: list[str] = []
     with bar("drawing", "study" if swept else "frame") as shown:
         if swept:
-            ppps = args.ppp or [first.mean_photons]
+            ppps = asked.ppp or [first.mean_photons]
             drawing = TimeForecast(f"drawing {len(speeds) * len(ppps)} studies", note, unit="study")
             progress = _both(shown, drawing)
             found = speed_sweep.sweep(clips, ppps, settings, widen=widen, progress=progress)
@@ -168,26 +236,26 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
             text.append(speed_sweep.summary(found))
             answers = found.answers
         else:
-            asked = replace(settings, ppp=levels[0], speed=clips[0].step)
+            chosen = replace(settings, ppp=levels[0], speed=clips[0].step)
             progress = _both(shown, TimeForecast("drawing the study", note, unit="frame"))
-            one = widened(first, asked, note) if widen else study(first, asked, progress=progress)
+            one = widened(first, chosen, note) if widen else study(first, chosen, progress=progress)
             result = speed_sweep.study_dict(one)
             pictures = {"tradeoff.png": figures.study_figure(one)}
             text += speed_sweep.table(one)
             settings = replace(settings, bits=one.bits)
             answers = [answer(one)]
-    if args.px:
-        result["px_asked"], result["speeds_found"] = args.px, speeds
-        text = [f"--px {px:g}: speed factor {speed:g}" for px, speed in zip(args.px, speeds, strict=True)] + text
-    if args.streams:
-        args.after_interrupt = MAKES_AGAIN
+    if asked.px:
+        result["px_asked"], result["speeds_found"] = asked.px, speeds
+        text = [f"--px {px:g}: speed factor {speed:g}" for px, speed in zip(asked.px, speeds, strict=True)] + text
+    if asked.streams:
+        running().after_interrupt = MAKES_AGAIN
         lit = replace(settings, ppp=levels[0])
-        made = study_clips.write_streams(first, args.output / "streams", lit, force=args.force)
+        made = study_clips.write_streams(first, asked.folder / "streams", lit, force=asked.force)
         result["streams"] = [str(path) for path in made]
         text += [f"streams 'planes' and 'multibit': {path}" for path in made]
-    if args.output is not None:
-        text += _write_study(args.output, "tradeoff.json", result, pictures)
-    output(args, result, text + answers)
+    if asked.output is not None:
+        text += _write_study(asked.folder, "tradeoff.json", result, pictures)
+    output(result, text + answers)
     return 0
 
 
@@ -205,7 +273,7 @@ def _both(one: Progress, other: Progress) -> Progress:
     return told
 
 
-def _speeds(args: argparse.Namespace, shape: Any) -> list[float]:
+def _speeds(asked: Tradeoff, shape: Any) -> list[float]:
     """Return the factors on the motion, found from --px or given."""
     from functools import partial
 
@@ -213,17 +281,17 @@ def _speeds(args: argparse.Namespace, shape: Any) -> list[float]:
     from qsim.streams.clip import Clip
     from qsim.studies.bit_depth import answer as tradeoff_answer
 
-    if not args.px:
-        return args.speed or [1.0]
+    if not asked.px:
+        return asked.speed or [1.0]
     found: list[tuple[float, float]] = []
-    if (Path(args.source) / "clip.json").is_file():
-        clip = Clip.open(args.source)
-        found = [tradeoff_answer.step_for(px, clip) for px in args.px]
-    elif args.source in scenes.FAMILIES or args.source.endswith(".py"):
-        motion = partial(_motion, args.source, shape)
-        found = [tradeoff_answer.speed_for(px, motion, args.source) for px in args.px]
+    if (Path(asked.named) / "clip.json").is_file():
+        clip = Clip.open(asked.named)
+        found = [tradeoff_answer.step_for(px, clip) for px in asked.px]
+    elif asked.named in scenes.FAMILIES or asked.named.endswith(".py"):
+        motion = partial(_motion, asked.named, shape)
+        found = [tradeoff_answer.speed_for(px, motion, asked.named) for px in asked.px]
     if len({speed for speed, _ in found}) < len(found):
-        raise ValueError(f"{args.source}: several of --px {args.px} need one and the same speed; give fewer")
+        raise ValueError(f"{asked.named}: several of --px {asked.px} need one and the same speed; give fewer")
     return [speed for speed, _ in found] or [1.0]  # 1: `clips_for` refuses what is neither a clip nor a scene
 
 
@@ -243,19 +311,19 @@ def _write_study(folder: Path, name: str, result: dict[str, Any], pictures: dict
     return ["written: " + ", ".join(str(folder / written) for written in [*pictures, name])]
 
 
-def _paper_figure(args: argparse.Namespace) -> int:
+def _paper_figure(asked: Tradeoff) -> int:
     from qsim.streams.clip import Clip
     from qsim.studies.bit_depth import clips as study_clips
     from qsim.studies.bit_depth import paper_figures
 
-    height, width = args.size or (96, 128)
-    number = args.paper_figure
-    speeds = args.speed or [1.0]
+    height, width = asked.size or (96, 128)
+    number = asked.paper_figure
+    speeds = asked.speed or [1.0]
     if len(speeds) > 1:
-        raise ValueError(f"--speed {args.speed}: --paper-figure draws one speed; give one")
+        raise ValueError(f"--speed {asked.speed}: --paper-figure draws one speed; give one")
     rate, frames = (paper_figures.RATE_1, 201) if number == 1 else (10_000.0, 511)
-    shape = study_clips.ClipShape(frames, height, width, rate, seed=args.seed)
-    names = [args.source] if args.source else ["fan"] if number == 1 else ["fan", "text"]
+    shape = study_clips.ClipShape(frames, height, width, rate, seed=asked.draws)
+    names = [asked.source] if asked.source else ["fan"] if number == 1 else ["fan", "text"]
     rows = []
     result = []
     for name, ppp in zip(names * (2 // len(names) if number == 2 else 1), (0.51, 0.40), strict=False):
@@ -263,35 +331,35 @@ def _paper_figure(args: argparse.Namespace) -> int:
             clip = Clip.open(name)
         else:
             with bar(name) as progress:
-                path = args.output / "clips" / Path(name).stem
+                path = asked.folder / "clips" / Path(name).stem
                 clip = study_clips.render(name, path, shape, speed=speeds[0], progress=progress)
         panels = (
-            paper_figures.figure_1(clip, seed=args.seed)
+            paper_figures.figure_1(clip, seed=asked.draws)
             if number == 1
-            else (paper_figures.figure_2(clip, ppp, seed=args.seed))
+            else (paper_figures.figure_2(clip, ppp, seed=asked.draws))
         )
         rows.append(panels)
         result.append({"clip": clip.name, "panels": [{"label": p.label, **p.numbers} for p in panels]})
     found = {"figure": number, "rows": result}
     text = [f"{row['clip']}: {panel}" for row in result for panel in row["panels"]]
-    text += _write_study(args.output, f"figure{number}.json", found, {f"figure{number}.png": paper_figures.draw(rows)})
-    output(args, found, text)
+    text += _write_study(asked.folder, f"figure{number}.json", found, {f"figure{number}.png": paper_figures.draw(rows)})
+    output(found, text)
     return 0
 
 
-def _tradeoff_table(args: argparse.Namespace) -> int:
+def _tradeoff_table(asked: Tradeoff) -> int:
     from qsim.studies.bit_depth.laws import depths
 
-    height, width = args.size or (240, 320)
-    rate = 10_000.0 if args.base_fps is None else args.base_fps
-    noise = 0.2 if args.read_noise is None else args.read_noise
-    speed = 2500.0 if args.motion is None else args.motion
+    height, width = asked.size or (240, 320)
+    rate = 10_000.0 if asked.base_fps is None else asked.base_fps
+    noise = 0.2 if asked.read_noise is None else asked.read_noise
+    speed = 2500.0 if asked.motion is None else asked.motion
     rows = depths(
         height=height,
         width=width,
         base_fps=rate,
         read_noise=noise,
-        bits=args.bits or [1, 3, 5, 7, 9],
+        bits=asked.bits or [1, 3, 5, 7, 9],
         speed=speed,
     )
     text = [
@@ -304,5 +372,5 @@ def _tradeoff_table(args: argparse.Namespace) -> int:
         f"  {r.read_noise_quadrature:13.2f}  {r.data_rate_megabytes_per_second:9.3f}"
         for r in rows
     ]
-    output(args, {"rows": [asdict(r) for r in rows]}, text)
+    output({"rows": [asdict(r) for r in rows]}, text)
     return 0

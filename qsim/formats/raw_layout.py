@@ -24,11 +24,9 @@ from qsim.checks import check_shape
 from qsim.clip.source import Source
 from qsim.file_order import numbered
 from qsim.formats import gaps
-from qsim.formats.recording import Hints, Recording, check_size, values_recording
+from qsim.formats.recording import ENDIANS, ORDERS, Hints, Recording, check_size, values_recording
 
 LARGEST_SIDE_FILE = 1 << 20  # bytes of a .cihx
-ORDERS = ("msb", "lsb")
-ENDIANS = ("little", "big")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy import ndarray as Array
@@ -17,8 +18,13 @@ from numpy import ndarray as Array
 from qsim.arrays import plain
 from qsim.clip.source import Flip, Source, Times
 from qsim.colour import TRANSFERS, to_linear
+from qsim.kinds import Bits, Count, Positive, Text, Whole
+from qsim.settings import setting
 
 Marked = Callable[[int, int], tuple[Array, Array]]
+
+ORDERS = ("msb", "lsb")  # of bits in a byte
+ENDIANS = ("little", "big")  # of bytes in a pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,29 +64,62 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Hints:
+class Layout:
+    """Where the values of a file lie, which it may not state: for frames of light and for codes."""
+
+    SECTION: ClassVar[str] = "what a foreign file may not state"
+
+    layout: Annotated[Text | None, setting("kind of the input, as in tiff or raw; a wrong name lists all")] = None
+    height: Annotated[Whole | None, setting("pixels")] = None
+    width: Annotated[Whole | None, setting("pixels per row, before packing")] = None
+    order: Annotated[
+        str | None, setting("raw: pixels are packed to bits, and this bit of a byte comes first", choices=ORDERS)
+    ] = None
+    endian: Annotated[
+        str | None, setting("raw: pixels fill whole bytes, and this byte comes first", choices=ENDIANS)
+    ] = None
+    skip_bytes: Annotated[Count | None, setting("raw: bytes before the first frame of a file", shown="N")] = None
+    row_padding: Annotated[
+        Count | None,
+        setting("raw: rows begin at a byte, and N bytes follow each", unset="rows follow bit by bit", shown="N"),
+    ] = None
+    axes: Annotated[
+        Text | None, setting("names of the axes of an array, an HDF5 dataset or a TIFF, as in TCYX or YXT")
+    ] = None
+    channel: Annotated[Count | None, setting("index of an axis C to read, from 0", shown="N")] = None
+    slice: Annotated[Count | None, setting("index of an axis Z to read, from 0", shown="N")] = None
+    dataset: Annotated[
+        Text | None,
+        setting("HDF5: path of the array in the file, as in entry/data", unset="the only one", shown="PATH"),
+    ] = None
+    variable: Annotated[Text | None, setting("array of a .mat file", unset="OUTPUT, or the only one")] = None
+
+
+@dataclass(frozen=True)
+class Hints(Layout):
     """Facts that a file may not state and the user can."""
 
-    layout: str | None = None  # a name of formats.LAYOUTS
-    height: int | None = None
-    width: int | None = None  # before packing
-    bits: int | None = None
-    transfer: str | None = None  # how the light in a picture was coded: linear, srgb, gamma 2.2
-    channel: int | None = None  # of a colour cube: 0, 1, 2
-    flip: Flip = "none"  # lr, ud or both: undoes the orientation of a layout with unknown convention
-    columns: int | None = None  # keep only the first columns (raw Vidar dumps have 416, of which 400 are pixels)
-    stretched: bool = False  # codes were stretched to 0 ... 255
-    variable: str | None = None  # the array of a .mat file, where it holds several
-    dataset: str | None = None  # the path of an array in an HDF5 file
-    axes: str | None = None  # names of the axes of an array or TIFF, as in TCYX
-    slice: int | None = None  # of an axis Z
-    order: str | None = None  # raw pixels packed to bits: msb or lsb is the first of a byte
-    endian: str | None = None  # raw pixels of whole bytes: little or big
-    skip_bytes: int | None = None  # before the first raw frame
-    row_padding: int | None = None  # bytes after each raw row, which begins at a byte; None: rows follow bit by bit
-    black: float | None = None  # of light: pixel value without light; None: 0
-    keep_gaps: bool = False  # frames that the recording states as lost are stored as missing
-    white: float | None = None  # of light: pixel value at which the camera saturates; None: full scale of whole numbers
+    bits: Annotated[Bits | None, setting("the input holds codes of this many bits")] = None
+    transfer: Annotated[
+        str | None, setting(f"how pictures code light: {', '.join(TRANSFERS)} (also for writing)", shown="TRANSFER")
+    ] = None
+    stretched: Annotated[bool, setting("codes were stretched to 0..255")] = False
+    flip: Annotated[Flip, setting("mirror the frames: left-right, up-down or both")] = "none"
+    columns: Annotated[Whole | None, setting("keep only the first columns (Vidar dumps: 400 of 416)")] = None
+    black: Annotated[
+        Positive | None, setting("pixel value without light, as in 64, which is subtracted", unset="0")
+    ] = None
+    keep_gaps: Annotated[
+        bool,
+        setting("store lost frames, which numbers or time stamps show, as frames without valid pixels (light)"),
+    ] = False
+    white: Annotated[
+        Positive | None,
+        setting(
+            "reading: pixel value at which the camera saturates, as in 4095 (default: the largest that whole numbers "
+            "hold); writing pictures: light that becomes full scale (default: the 99.9th percentile)"
+        ),
+    ] = None
 
 
 def check_size(path: Path, size: int, frame_bytes: int, what: str, footer: tuple[int, ...] = (0,)) -> int:

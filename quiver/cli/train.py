@@ -2,100 +2,51 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import signal
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from qsim import checks
-from qsim.cli.console import WITHOUT_FORCE, failed, note, output
-from qsim.cli.options import check_free, checked, count, nonnegative, positive
-from quiver.cli.options import (
-    PROTOCOLS,
-    add_noise,
-    add_preset,
-    add_running,
-    add_threads,
-    command,
-    handling,
-    running_options,
-    use_threads,
-)
+from qsim.checks import ArgumentError
+from qsim.cli.command import command
+from qsim.cli.console import RESUMES, WITHOUT_FORCE, failed, note, output, running
+from qsim.cli.options import check_free
+from qsim.kinds import Split
+from qsim.settings import setting
+from quiver.cli.options import handling, use_threads
 from quiver.device import DEVICES
-from quiver.restoration.interface import NETWORKS, QUIVERS
-from quiver.training.saving import WHEN
-
-# train
+from quiver.restoration.interface import QUIVERS, RestoreOptions
+from quiver.training.settings import Settings
 
 DIVERGED = 3  # exit code of a run whose loss became NaN or infinite
 
+Protocol = Literal["quick", "control", "published", "paper", "spad-sum"]  # see quiver/training/settings.py
 
-def add_train(sub: Any) -> None:
-    parser = command(
-        sub,
-        "train",
-        _run_train,
-        "Train a network on the clips of a data set; rerun the same command to resume.",
-        "quiver train out/starter -o out/mine --minutes 20\n"
-        "quiver train out/starter -o out/unet --preset unet --protocol control --minutes 20\n"
-        "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
-        resumes=True,
-    )
-    parser.add_argument(
-        "data",
-        nargs="+",
-        help="data set folder, or several, whose clips count alike; for bit2bit a stored stream, or a clip with one",
-    )
-    parser.add_argument("-o", "--output", required=True, help=f"folder of the run; its state is {WHEN}")
-    add_preset(parser, "mergenet", NETWORKS)
-    parser.add_argument(
-        "--protocol",
-        default="quick",
-        choices=PROTOCOLS,
-        help="bundle of defaults (default quick); compared networks have quick and published",
-    )
-    parser.add_argument("--start", help="weights to start from: a name that ships, a weights file or a run folder")
-    parser.add_argument("--steps", type=count, help="optimiser steps")
-    parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate follows it")
-    add_noise(parser)
-    parser.add_argument("--crop", type=count, help="px, side of the training windows")
-    parser.add_argument(
-        "--frames",
-        type=count,
-        help="frames of a training window (default: the protocol's, mostly 11; of 16, QUIVER restores six)",
-    )
-    parser.add_argument("--batch", type=count, help="windows per step and process")
-    parser.add_argument("--optimiser", choices=("adam", "muon"), help="optimiser (default: the protocol's)")
-    parser.add_argument("--learning-rate", type=positive, help="highest learning rate")
-    parser.add_argument("--schedule", choices=("cosine", "plateau"), help="schedule of the learning rate")
-    parser.add_argument(
-        "--loss",
-        choices=("published", "paper", "l1", "scales-l1"),
-        help="of quiver and unet; default: the protocol's; compared networks have their own",
-    )
-    parser.add_argument("--validate-every", type=count, help="steps between validations")
-    parser.add_argument(
-        "--validation-split", choices=("train", "val", "test"), help="split to validate on (default val)"
-    )
-    parser.add_argument("--workers", type=nonnegative, help="processes that draw samples (default 0: this one)")
-    add_threads(parser)
-    parser.add_argument(
-        "--precision",
-        choices=("auto", "float32", "bfloat16"),
-        help="precision (default auto: bfloat16 on CUDA; published protocols: float32)",
-    )
-    parser.add_argument("--device", default="auto", choices=DEVICES, help="device (default auto)")
-    parser.add_argument("--seed", type=checked(checks.seed), help="of weights, samples and noise (default 0)")
-    parser.add_argument("--force", action="store_true", help="replace an existing run")
+# ---- train
 
 
-def _run_train(args: argparse.Namespace) -> int:
+@dataclass(frozen=True)
+class Train:
+    """How `quiver train` runs; what it trains are the `Settings`, whose defaults the protocol has."""
+
+    protocol: Annotated[Protocol, setting("bundle of defaults; compared networks have quick and published")] = "quick"
+    device: Annotated[str, setting("device", choices=DEVICES)] = "auto"
+    force: Annotated[bool, setting("replace an existing run")] = False
+
+
+@command(
+    "quiver train out/starter -o out/mine --minutes 20",
+    "quiver train out/starter -o out/unet --preset unet --protocol control --minutes 20",
+    "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
+    after_interrupt=RESUMES,
+)
+def train(asked: Train, given: Annotated[dict[str, Any], Settings]) -> int:
+    """Train, or resume a run; return 3 if it diverges."""
     import torch
 
     from quiver import threads
@@ -103,84 +54,83 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver.device import pick_device
     from quiver.model.weights import digest
     from quiver.restoration.restorers import weights_path
-    from quiver.training.loop import Diverged, train
+    from quiver.training import loop
+    from quiver.training.loop import Diverged
     from quiver.training.run_folder import draw_curve
 
-    if args.force:
-        args.after_interrupt = WITHOUT_FORCE
+    if asked.force:
+        running().after_interrupt = WITHOUT_FORCE
 
-    first = None if args.start is None else weights_path(args.start)
-    args.start = None if first is None else digest(first)
-    args.data = args.data[0] if len(args.data) == 1 else tuple(args.data)
-    settings = _settings(args)
-    if args.preset.startswith("bit2bit"):
-        settings = _of_stream(args, settings)
-    if args.validate_every is not None and settings.steps is None:
+    first = weights_path(given["start"]) if "start" in given else None
+    settings = settings_of_run(asked.protocol, given | ({} if first is None else {"start": digest(first)}))
+    if settings.network.startswith("bit2bit"):
+        settings = _of_stream(given, settings)
+    if "validate_every" in given and settings.steps is None:
         raise ValueError(
             "--validate-every: counts steps of a run with --steps; a run that --minutes ends is validated "
             "after every tenth of its time; leave it out"
         )
-    if args.validation_split is not None and not split_clips(settings.data, args.validation_split)[1]:
+    if "validation_split" in given and not split_clips(settings.data, settings.validation_split)[1]:
         raise ValueError(
-            f"--validation-split {args.validation_split}: {', '.join(settings.folders)} has no clip in that split; "
+            f"--validation-split {settings.validation_split}: {', '.join(settings.folders)} has no clip in that split; "
             "leave it out, and without clips in `val` training clips serve"
         )
     folder = Path(settings.out)
     leads = os.environ.get("RANK", "0") == "0"
-    earlier = None if args.force else threads.recorded(folder / "settings.json")
-    settings = replace(settings, threads=use_threads(args, earlier))
+    earlier = None if asked.force else threads.recorded(folder / "settings.json")
+    settings = replace(settings, threads=use_threads(settings.threads, earlier))
     torch.manual_seed(settings.seed)
     interrupted: list[int] = []
     try:
         with _signals(interrupted):
-            state = train(
-                network_of(args, settings, first),
+            state = loop.train(
+                network_of(settings, first),
                 settings,
-                device=pick_device(args.device),
+                device=pick_device(asked.device),
                 should_stop=lambda: bool(interrupted),
-                progress=not (args.json or args.quiet),
-                force=args.force,
+                progress=not running().silent,
+                force=asked.force,
                 note=note,
             )
     except Diverged as error:
-        return failed(f"quiver: {error}", DIVERGED, args.json and leads)
+        return failed(f"quiver: {error}", DIVERGED, running().printing.json and leads)
     if leads:
         draw_curve(folder, state.history)
-        output(args, *_summary(folder, state))
+        output(*_summary(folder, state))
     if interrupted:
-        print(f"quiver: interrupted; {args.after_interrupt}", file=sys.stderr)
+        print(f"quiver: interrupted; {running().after_interrupt}", file=sys.stderr)
         return 130
     return 0
 
 
-def _settings(args: argparse.Namespace) -> Any:
-    """Return the protocol's settings, replaced by the options that are given."""
-    from quiver.training.settings import Settings
+def settings_of_run(bundle: str, given: Mapping[str, Any]) -> Settings:
+    """Return the settings of a protocol, replaced by those that are given."""
     from quiver.training.system import protocol
     from quiver.training.systems import system_named
 
-    given = {field.name: getattr(args, field.name, None) for field in fields(Settings)}
-    given |= {"data": args.data, "out": args.output, "network": args.preset}
-    defaults = dict(protocol(system_named(args.preset), args.protocol))
-    if any(sensor.endswith(".toml") for sensor in args.sensor or ()):
+    defaults = dict(protocol(system_named(given.get("network", Settings.network)), bundle))
+    if any(sensor.endswith(".toml") for sensor in given.get("sensor", ())):
         defaults.pop("bits", None)  # a sensor file states its own; a named sensor beside it has those of the streams
-    return Settings(**defaults | {name: value for name, value in given.items() if value is not None})
+    data = given["data"]
+    named = {"data": data[0] if len(data) == 1 else data} if isinstance(data, tuple) else {}
+    return Settings(**defaults | dict(given) | named)
 
 
-def _of_stream(args: argparse.Namespace, settings: Any) -> Any:
-    """Return the settings with the light of a stream; `ValueError` for options that act on data sets alone."""
+def _of_stream(given: Mapping[str, Any], settings: Settings) -> Settings:
+    """Return the settings with the light of a stream; `ArgumentError` for those that act on data sets alone."""
     from quiver.data.stream_windows import stream_at
-    from quiver.restoration.sources import refuse
     from quiver.training.self_supervised import own_light
 
-    names = ("sensor", "ppp", "bits", "validate_every", "validation_split")
-    refuse(args, names, f"is for data sets, and {args.preset} learns from one stream")
+    for name in ("sensor", "ppp", "bits", "validate_every", "validation_split"):
+        if name in given:
+            why = f"is for data sets, and {settings.network} learns from one stream"
+            raise ArgumentError(name, f"{why}; leave it out")
     if len(settings.folders) > 1:
-        raise ValueError(f"{', '.join(settings.folders)}: {args.preset} learns from one stream; give one")
+        raise ValueError(f"{', '.join(settings.folders)}: {settings.network} learns from one stream; give one")
     return own_light(settings, stream_at(Path(settings.folders[0])))
 
 
-def network_of(args: argparse.Namespace, settings: Any, first: Path | None = None) -> Any:
+def network_of(settings: Settings, first: Path | None = None) -> Any:
     """Return the network of the preset with random weights, or those of the file `first`; bit2bit for the law of its
     stream. `ValueError` for weights of another network.
     """
@@ -190,7 +140,7 @@ def network_of(args: argparse.Namespace, settings: Any, first: Path | None = Non
     from quiver.model.rivals.bit2bit import Bit2Bit
     from quiver.training.self_supervised import config_for
 
-    network = build(args.preset)
+    network = build(settings.network)
     if isinstance(network, Bit2Bit):
         network = Bit2Bit(config_for(stream_at(Path(settings.folders[0])), network.config))
     if first is None:
@@ -199,7 +149,7 @@ def network_of(args: argparse.Namespace, settings: Any, first: Path | None = Non
     if type(loaded) is not type(network) or loaded.config != network.config:
         raise ValueError(
             f"--start {first}: weights of {type(loaded).__name__} with another configuration than the "
-            f"preset {args.preset}; name the preset that they were trained with"
+            f"preset {settings.network}; name the preset that they were trained with"
         )
     return loaded.train()
 
@@ -239,35 +189,29 @@ def _drop_after(best: float, history: Sequence[Mapping[str, float]]) -> str:
     )
 
 
-# ablate
+# ---- ablate
 
 
-def add_ablate(sub: Any) -> None:
-    parser = command(
-        sub,
-        "ablate",
-        _run_ablate,
-        "Train the network in six versions, without some of its parts, and compare them.",
-        "quiver ablate out/starter -o out/ablation --minutes 20",
-        resumes=True,
-    )
-    parser.add_argument("data", help="data set folder")
-    parser.add_argument("-o", "--output", required=True, help="folder of the six runs and their table")
-    add_preset(parser, "quiver-s", QUIVERS)
-    parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
-    parser.add_argument("--steps", type=count, help="optimiser steps of each")
-    parser.add_argument("--minutes", type=positive, help="wall-clock limit of each")
-    add_noise(parser)
-    parser.add_argument("--crop", type=count, help="px, side of the training windows")
-    parser.add_argument("--batch", type=count, help="windows per step and process")
-    parser.add_argument(
-        "--split", default="test", choices=("train", "val", "test"), help="split to score on (default test)"
-    )
-    parser.add_argument("--seed", type=checked(checks.seed), help="of weights, samples and noise (default 0)")
-    add_running(parser)
+@dataclass(frozen=True)
+class Ablate:
+    """Which network is trained without some of its parts, and on which clips the versions are compared."""
+
+    data: Annotated[str, setting("data set folder", positional=True)]
+    output: Annotated[str, setting("folder of the six runs and their table", short="o")]
+    preset: Annotated[str, setting("network", choices=QUIVERS)] = "quiver-s"
+    protocol: Annotated[Protocol, setting("bundle of defaults")] = "quick"
+    split: Annotated[Split, setting("split to score on")] = "test"
 
 
-def _run_ablate(args: argparse.Namespace) -> int:
+@command("quiver ablate out/starter -o out/ablation --minutes 20", after_interrupt=RESUMES)
+def ablate(
+    asked: Ablate,
+    given: Annotated[
+        dict[str, Any], Settings, "steps", "minutes", "sensor", "ppp", "bits", "crop", "batch", "seed", "threads"
+    ],
+    options: RestoreOptions,
+) -> int:
+    """Train what is missing of the six runs, score them and print the table."""
     from quiver import threads
     from quiver.evaluation import summary
     from quiver.evaluation.comparison import Comparison
@@ -275,40 +219,40 @@ def _run_ablate(args: argparse.Namespace) -> int:
     from quiver.training.ablation import markdown, one_noise, run_ablation
     from quiver.training.loop import Diverged
 
-    check_free(Path(args.output))
-    _check_scored(args.data, args.split)
-    args.precision, precision = None, args.precision  # for restoring; training has another default
-    settings = _settings(args)
-    args.precision = precision
-    first = Path(args.output) / next(iter(ABLATIONS)) / "settings.json"
-    settings = replace(settings, threads=use_threads(args, threads.recorded(first)))
+    check_free(Path(asked.output))
+    _check_scored(asked.data, asked.split)
+    settings = settings_of_run(
+        asked.protocol, given | {"data": asked.data, "out": asked.output, "network": asked.preset}
+    )
+    first = Path(asked.output) / next(iter(ABLATIONS)) / "settings.json"
+    settings = replace(settings, threads=use_threads(settings.threads, threads.recorded(first)))
     try:
         settings, lines = one_noise(settings)
         for line in lines:
             note(line)
         lights = settings.noise or ()
-        comparison = Comparison(args.data, args.split, lights, settings.seed)
+        comparison = Comparison(asked.data, asked.split, lights, settings.seed)
         interrupted: list[int] = []
         found = run_ablation(
             settings,
             comparison,
-            running_options(args),
+            options,
             should_stop=lambda: bool(interrupted),
             while_training=_signals(interrupted),
-            progress=not (args.json or args.quiet),
+            progress=not running().silent,
         )
     except Diverged as error:
         text = _without_force(error, "choose another --protocol or --seed, and another -o")
-        return failed(f"quiver: {text}", DIVERGED, args.json)
+        return failed(f"quiver: {text}", DIVERGED, running().printing.json)
     except (FileExistsError, ValueError) as error:
         if "--force" not in str(error):
             raise
         raise FileExistsError(_without_force(error, "choose another -o")) from error
     if found is None:
-        return failed("quiver: interrupted; the same command resumes where it stopped", 130, args.json)
+        return failed("quiver: interrupted; the same command resumes where it stopped", 130, running().printing.json)
     methods, rows = found
-    summary.write(Path(args.output) / "table", comparison, methods, rows)
-    output(args, summary.as_dict(comparison, methods, rows), markdown(args.preset, rows))
+    summary.write(Path(asked.output) / "table", comparison, methods, rows)
+    output(summary.as_dict(comparison, methods, rows), markdown(asked.preset, rows))
     return 1 if any(row.failure for row in rows) else 0
 
 

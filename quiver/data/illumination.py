@@ -37,6 +37,11 @@ OTHERS = "give --sensor, --bits and --ppp, in Python WindowSettings(lights=...)"
 LONGEST = 500  # characters of a stored name
 
 
+def sensor_names() -> Iterable[str]:
+    """Return the named sensors."""
+    return devices.DEVICES
+
+
 @dataclass(frozen=True)
 class Illumination:
     """A sensor, the light that it receives, and its noise."""

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.files import Progress
+from qsim.kinds import Count
+from qsim.settings import setting, settle
+from qsim.words import memory_size
 from quiver.data.codes import Codes, light_of
-from quiver.device import HOST_MEMORY, default_memory, pick_device
+from quiver.device import DEVICES, HOST_MEMORY, default_memory, pick_device
 from quiver.model.names import NETWORKS as NETWORKS
 from quiver.model.names import QUIVERS as QUIVERS
 from quiver.restoration.domain import UP_TO_A_FACTOR, Scope, place_of, remark
@@ -18,6 +22,7 @@ from quiver.restoration.mosaics import by_colour, fill_mosaic
 
 AUTO = "auto"  # chooses the method of a stream: see automatic.py
 DEFAULT_METHOD = AUTO  # of `quiver restore` and `quiver.restore`
+PRECISIONS = ("float32", "bfloat16")
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/model/schedules.py
 
 # Adds the photons of frames `first` ... to zeros [t, H, W]; called with (codes, zeros, first, progress)
@@ -32,18 +37,23 @@ class RestoreOptions:
     A warning then states the difference.
     """
 
-    memory: int | None = None  # bytes of working memory; None = 2 GB, on a GPU half of its memory (`bound`)
-    mode: str = "exact"  # exact = the published windows; streaming = state kept, faster; windows = recomputed
-    device: str = "auto"  # one of quiver.device.DEVICES
-    precision: str = "float32"  # or bfloat16
+    memory: Annotated[
+        Count | None,
+        setting(
+            "working memory, as in 500MB",
+            unset="2GB; on a GPU half of its memory for networks other than mergenet",
+            read=memory_size,
+        ),
+    ] = None  # bytes
+    mode: Annotated[
+        str,
+        setting("networks: how frames share work, exact for the published windows, streaming is faster", choices=MODES),
+    ] = "exact"
+    device: Annotated[str, setting("networks: where they run", choices=DEVICES)] = "auto"
+    precision: Annotated[str, setting("networks: precision", choices=PRECISIONS)] = "float32"
 
     def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise ValueError(f"mode {self.mode!r}; known are {', '.join(MODES)}")
-        if self.precision not in ("float32", "bfloat16"):
-            raise ValueError(f"precision {self.precision!r}; known are float32 and bfloat16")
-        if self.memory is not None and self.memory < 1:
-            raise ValueError(f"memory is in bytes and above 0, got {self.memory}")
+        settle(self)
 
     def bound(self, *, host: bool = False) -> int:
         """Return the working memory [bytes] on the device, or of what runs on the `host` alone."""

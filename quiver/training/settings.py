@@ -2,88 +2,136 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import numpy as np
+
+from qsim import records
 from qsim.files import read_json
+from qsim.kinds import Bits, Count, Light, Positive, Seed, Split, Text, Whole
+from qsim.settings import setting
+from qsim.words import positive_numbers
 from quiver import threads
 from quiver.data.clips import open_clips
-from quiver.data.illumination import Illumination
+from quiver.data.illumination import Illumination, sensor_names
 from quiver.data.mixture import Mixture, choose, describe
+from quiver.restoration.interface import NETWORKS
+from quiver.restoration.settings import method_names
 from quiver.training.loss import PRESETS as LOSSES
-from quiver.training.optimiser import OPTIMISERS, Kind
+from quiver.training.optimiser import Kind
+from quiver.training.saving import WHEN
 
-SCHEDULES = ("cosine", "plateau")
-PRECISIONS = ("auto", "float32", "bfloat16")
+LEVELS = 16  # of a range of light in training: from 0.3 to 100 photons they are a factor 1.47 apart
+
+
+def light_levels(text: str) -> tuple[float, ...]:
+    """Return light levels [photons] of a list, in which LOW..HIGH stands for LEVELS of them at equal ratios.
+
+    Levels, not a continuum: the sensor follows the light, and each one has a table of its law.
+    """
+    found: list[float] = []
+    for part in text.split(","):
+        if ".." not in part:
+            found += positive_numbers(part)
+            continue
+        ends = positive_numbers(part.replace("..", ",", 1))
+        if not (len(ends) == 2 and ends[0] < ends[1]):
+            raise ValueError(f"expected LOW..HIGH with LOW below HIGH, got {part!r}")
+        found += [float(f"{level:.3g}") for level in np.geomspace(ends[0], ends[1], LEVELS)]
+    return tuple(found)
 
 
 @dataclass(frozen=True)
 class Settings:
     """All that a run depends on; stored beside its results."""
 
-    data: str | tuple[str, ...]  # data set folder, or several
-    out: str  # folder of the run
-    network: str = "mergenet"  # name of the model, for the record
-    start: str | None = None  # digest (weights.py) of the weights that the run starts from; None: random weights
-    steps: int | None = None  # of the optimiser; with `minutes` too, the limit that is reached first ends the run
-    minutes: float | None = None  # wall-clock limit, validation included
-    sensor: str | tuple[str, ...] | None = None  # as given; None: those of the data set's streams
-    ppp: tuple[float, ...] | None = None  # light levels as given; None: those of the streams
-    bits: tuple[int, ...] | None = None  # bit depths as given; None: those of the streams
+    data: Annotated[
+        str | tuple[Text, ...],
+        setting(
+            "data set folder, or several, whose clips count alike; for bit2bit a stored stream, or a clip with one",
+            positional=True,
+        ),
+    ]
+    out: Annotated[str, setting(f"folder of the run; its state is {WHEN}", option="output", short="o")]
+    network: Annotated[str, setting("network", option="preset", choices=NETWORKS)] = "mergenet"
+    start: Annotated[
+        Text | None,
+        setting("weights to start from: a name that ships, a weights file or a run folder", known=method_names),
+    ] = None  # the digest (weights.py) of their values; None: random weights
+    steps: Annotated[Whole | None, setting("optimiser steps")] = None  # with `minutes`, what is reached first ends it
+    minutes: Annotated[
+        Positive | None, setting("wall-clock limit, validation included; the learning rate follows it")
+    ] = None
+    sensor: Annotated[
+        str | tuple[Text, ...] | None,
+        setting(
+            "names of `qsim doctor --devices` or .toml files, comma-separated",
+            unset="the protocol's, which mergenet states, else those of the data set's streams",
+            known=sensor_names,
+        ),
+    ] = None
+    ppp: Annotated[
+        tuple[Light, ...] | None,
+        setting(
+            f"mean photons per pixel and exposure; several: 1,10, or {LEVELS} in a range: 0.3..100",
+            unset="the protocol's, else those of the streams",
+            read=light_levels,
+        ),
+    ] = None
+    bits: Annotated[
+        tuple[Bits, ...] | None,
+        setting("bits per code; several: 1,3", unset="the protocol's, else those of the streams"),
+    ] = None
     noise: tuple[Illumination, ...] | None = None  # follows from these three, set by `settled`; every window draws one
-    crop: int = 64  # px
-    frames: int = 11  # of a training window; more give more restored frames, at low cost in QUIVER
-    batch: int = 8  # of each process
-    optimiser: Kind = "adam"  # or muon: see optimiser.py
-    learning_rate: float = 1e-3
+    crop: Annotated[Whole, setting("px, side of the training windows", unset="the protocol's")] = 64
+    frames: Annotated[
+        Whole, setting("frames of a training window", unset="the protocol's, mostly 11; of 16, QUIVER restores six")
+    ] = 11  # more give more restored frames, at low cost in QUIVER
+    batch: Annotated[Whole, setting("windows per step and process", unset="the protocol's")] = 8
+    optimiser: Annotated[Kind, setting("optimiser", unset="the protocol's")] = "adam"  # see optimiser.py
+    learning_rate: Annotated[Positive, setting("highest learning rate", unset="the protocol's")] = 1e-3
     betas: tuple[float, float] = (0.9, 0.99)  # of Adam
-    schedule: str = "cosine"  # or plateau
+    schedule: Annotated[
+        Literal["cosine", "plateau"], setting("schedule of the learning rate", unset="the protocol's")
+    ] = "cosine"
     warmup: int = 100  # steps of linear rise, at most a twentieth of the run
     patience: int = 8  # plateau: validations without gain before the rate is halved
     clip_norm: float = 20.0  # L2 norm of the gradient
-    loss: str = "published"  # published, paper, l1, scales-l1: see loss.py; own: that of a compared network
+    loss: Annotated[
+        str,
+        setting(
+            "of quiver and unet; compared networks have their own", unset="the protocol's", choices=(*LOSSES, "own")
+        ),
+    ] = "published"  # see loss.py
     flips: bool = True  # the eight flips and quarter turns
     reverse: bool = True  # time reversal
     drift: int = 0  # px/frame, largest speed at which half of the crops move through their clip
     force_exposure: bool = False  # scale every window to the light level by its own mean, as published
-    validate_every: int = 300  # steps; without `steps` a run validates after every tenth of its time
-    validation_split: str = "val"
-    validation_windows: int = 16  # at most
-    workers: int = 0  # processes that draw samples; 0: the training process does
-    precision: str = "auto"  # float32, bfloat16; auto = bfloat16 on CUDA
-    seed: int = 0
-    threads: int | None = None  # of torch; None: measured
+    validate_every: Annotated[Whole, setting("steps between validations")] = (
+        300  # without `steps` a run validates after every tenth of its time
+    )
+    validation_split: Annotated[Split, setting("split to validate on")] = "val"
+    validation_windows: Whole = 16  # at most
+    workers: Annotated[Count, setting("processes that draw samples", unset="0: this one")] = 0
+    precision: Annotated[
+        Literal["auto", "float32", "bfloat16"],
+        setting("precision", unset="auto: bfloat16 on CUDA; published protocols: float32"),
+    ] = "auto"
+    seed: Annotated[Seed, setting("of weights, samples and noise")] = 0
+    threads: Annotated[
+        Whole | None,
+        setting("torch threads on the CPU", unset="measured at start; resumed work keeps its number"),
+    ] = None
 
     def __post_init__(self) -> None:
         if self.steps is None and self.minutes is None:
-            raise ValueError("give a training length: --steps N or --minutes M")
-        if self.threads is not None and (isinstance(self.threads, bool) or not isinstance(self.threads, int)):
-            raise ValueError(f"--threads must be a whole number, got {self.threads!r}")
-        for name in (
-            "steps",
-            "minutes",
-            "batch",
-            "crop",
-            "frames",
-            "validate_every",
-            "validation_windows",
-            "learning_rate",
-        ):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ValueError(f"--{name.replace('_', '-')} must be above 0, got {value!r}")
-        known_names = {
-            "schedule": SCHEDULES,
-            "precision": PRECISIONS,
-            "loss": (*LOSSES, "own"),
-            "optimiser": OPTIMISERS,
-        }
-        for name, known in known_names.items():
-            if getattr(self, name) not in known:
-                raise ValueError(f"no {name} is called {getattr(self, name)!r}; known are {', '.join(known)}")
+            raise ValueError("give a training length, as steps= or as minutes=")
+        records.settle(self)
+        if self.loss not in (*LOSSES, "own"):
+            raise ValueError(f"no loss is called {self.loss!r}; known are {', '.join((*LOSSES, 'own'))}")
 
     @property
     def folders(self) -> tuple[str, ...]:

@@ -7,7 +7,6 @@ Results are compared: pixels, codes, weights, numbers. A change of a description
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import re
@@ -15,7 +14,7 @@ import shlex
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -23,7 +22,8 @@ from unittest import mock
 import numpy as np
 from compiled_cases import loaded_drjit
 
-from qsim.cli.console import options_of
+from qsim.cli.setting_options import option_names
+from qsim.cli.usage import Program
 
 Main = Callable[[list[str]], int]
 
@@ -131,29 +131,21 @@ def loudness(lines: dict[str, str]) -> dict[tuple[str, str], list[Row]]:
 NOTE = "only a note:"  # before a command line: its own work is replaced by one line for people
 
 
-def parser_of(main: Main, home: Any) -> argparse.ArgumentParser:
-    """The parser that a program's `main` hands to `run` of the module `home`."""
-    got: list[argparse.ArgumentParser] = []
-    with mock.patch.object(home, "run", lambda parser, argv: got.append(parser) or 0):
-        main([])
-    return got[0]
-
-
-def options(parser: argparse.ArgumentParser, path: str) -> Iterator[tuple[str, str]]:
+def options(program: Program) -> Iterator[tuple[str, str]]:
     """(command, longest name) of every option of a program, but --help."""
-    found = options_of(parser)
-    for name, command in found.commands.items():
-        yield from options(command, f"{path} {name}".strip())
-    yield from ((path, action.option_strings[-1]) for action in found.options if action.dest != "help")
+    yield ("", "--version")
+    for name in program.commands:
+        for setting in program.declared(name).settings:
+            if not setting.positional:
+                yield from ((name, option) for option in option_names(setting) if option.startswith("--"))
 
 
-def names_of(parser: argparse.ArgumentParser, command: str, option: str) -> set[str]:
+def names_of(program: Program, command: str, option: str) -> set[str]:
     """Every spelling of an option of a command."""
-    found = options_of(parser)
-    if found.commands and command:
-        name, _, rest = command.partition(" ")
-        return names_of(found.commands[name], rest, option)
-    return next(set(a.option_strings) for a in found.options if option in a.option_strings)
+    if not command:
+        return {option}
+    settings = program.declared(command).settings
+    return next(set(option_names(setting)) for setting in settings if option in option_names(setting))
 
 
 def execute(main: Main, line: str, folder: Path, capsys: Any, monkeypatch: Any) -> Run:
@@ -174,14 +166,17 @@ def _only_a_note() -> Iterator[None]:
     """Inside, a command that is parsed writes one note in place of its work."""
     from qsim.cli import console
 
-    parse = argparse.ArgumentParser.parse_args
+    read = Program.read
 
-    def noted(*args: Any, **named: Any) -> argparse.Namespace:
-        found = parse(*args, **named)
-        found.run = lambda _: console.note("a note") or 0
-        return found
+    def noted() -> int:
+        console.note("a note")
+        return 0
 
-    with mock.patch.object(argparse.ArgumentParser, "parse_args", noted):
+    def replaced(program: Program, words: Any) -> Any:
+        command, values = read(program, words)
+        return (command and replace(command, run=noted, idle=())), values
+
+    with mock.patch.object(Program, "read", replaced):
         yield
 
 

@@ -28,6 +28,7 @@ import pytest
 
 import qsim.cli.program
 import quiver.cli.program
+from qsim.cli.usage import UsageError
 from qsim.studies.validation.reading import ReadingReport
 
 ROOT = Path(__file__).parents[2]
@@ -128,16 +129,15 @@ def test_the_clip_of_one_stream_holds_the_windows_of_its_network():
 
 
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
-def test_commands_are_understood(words, monkeypatch):
-    program = {"qsim": qsim.cli.program, "quiver": quiver.cli.program}[words[0]]
-    monkeypatch.setattr(program, "run", lambda parser, argv: parser.parse_args(argv))
-    assert program.main(words[1:]) is not None
+def test_commands_are_understood(words):
+    program = {"qsim": qsim.cli.program, "quiver": quiver.cli.program}[words[0]].PROGRAM
+    command, _ = program.read(words[1:])
+    assert command is program.declared(words[1])
 
 
-def test_a_wrong_command_would_be_noticed(monkeypatch):
-    monkeypatch.setattr(qsim.cli.program, "run", lambda parser, argv: parser.parse_args(argv))
-    with pytest.raises(SystemExit):
-        qsim.cli.program.main(["sense", "clip", "--pppp", "3"])
+def test_a_wrong_command_would_be_noticed():
+    with pytest.raises(UsageError, match="unknown option --pppp"):
+        qsim.cli.program.PROGRAM.read(["sense", "clip", "--pppp", "3"])
 
 
 def test_a_page_that_fails_would_be_noticed(tmp_path):

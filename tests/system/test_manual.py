@@ -16,7 +16,7 @@ import pytest
 import qsim.cli.program
 import quiver.cli.program
 from qsim.cli import documented_keys
-from qsim.cli.console import options_of
+from qsim.cli.setting_options import option_names
 
 pytest.importorskip("sphinx")
 pytest.importorskip("latex2mathml")
@@ -94,16 +94,18 @@ def test_fields_carry_the_comments_behind_them():
 
 @pytest.mark.parametrize("program", [qsim.cli.program, quiver.cli.program], ids=["qsim", "quiver"])
 def test_every_option_of_every_command_is_in_the_reference(program):
-    parser = program.parser()
-    page = (DOCS / f"{parser.prog}.md").read_text(encoding="utf-8")
+    found = program.PROGRAM
+    page = (DOCS / f"{found.name}.md").read_text(encoding="utf-8")
     text = commands.insert(page)
     parts = {part.partition("\n")[0]: part for part in text.split("\n## ")}
-    assert set(parts) >= {f"{parser.prog} {name}" for name in options_of(parser).commands}
-    for name, own in options_of(parser).commands.items():
-        for action in options_of(own).options:
-            for option in action.option_strings:
-                where = parts[f"{parser.prog} {name}"] if option not in ("-h",) else "`-h`"
-                assert f"`{option}" in where or f"`{option}`" in (DOCS / "qsim.md").read_text(encoding="utf-8"), option
+    assert set(parts) >= {f"{found.name} {name}" for name in found.commands}
+    common = (DOCS / "qsim.md").read_text(encoding="utf-8")
+    for name in found.commands:
+        for setting in found.declared(name).settings:
+            if not setting.positional:
+                for option in option_names(setting):
+                    where = parts[f"{found.name} {name}"]
+                    assert f"`{option}" in where or f"`{option}`" in common, option
 
 
 TABLES = [section for section, where in documented_keys.SECTIONS.items() if where.name]

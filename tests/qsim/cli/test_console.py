@@ -1,7 +1,7 @@
 """Tests completion of every option, quiet and verbose runs, warnings in one line, Ctrl-C."""
 
 import json
-import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -18,112 +18,97 @@ from waves import wave_clip
 import qsim.cli.program
 import quiver.cli.program
 from qsim.cli import console
-from qsim.cli.options import checked
+from qsim.cli.command import Printing
 from qsim.cli.program import main
 from qsim.clip.writer import ClipWriter
 from qsim.streams.clip import Clip
 
 ROOT = Path(__file__).parents[3]
+PROGRAMS = {"qsim": qsim.cli.program, "quiver": quiver.cli.program}
 
 
 def completion(capsys: pytest.CaptureFixture[str], program: str, shell: str) -> str:
-    assert {"qsim": qsim.cli.program.main, "quiver": quiver.cli.program.main}[program](["completion", shell]) == 0
+    assert PROGRAMS[program].main(["completion", shell]) == 0
     return capsys.readouterr().out
 
 
 def complete(script: str, program: str, *words: str, cwd: Path) -> list[str]:
     """What a real bash offers for the last word."""
+    (cwd / program).write_text(f'#!/bin/sh\nexec {sys.executable} -m {program} "$@"\n')
+    (cwd / program).chmod(0o755)
     code = (
-        f'{script}\nCOMP_WORDS=({program} "$@"); COMP_CWORD=$#; _{program}_complete; printf "%s\\n" "${{COMPREPLY[@]}}"'
+        f'{script}\nPATH="$PWD:$PATH" COMP_WORDS=({program} "$@"); COMP_CWORD=$#; _{program}; '
+        'printf "%s\\n" "${COMPREPLY[@]}"'
     )
     done = subprocess.run(["bash", "-c", code, "bash", *words], capture_output=True, text=True, check=True, cwd=cwd)
     return done.stdout.split()
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
-def test_bash_completes_commands_options_choices_and_files(capsys, tmp_path):
+def test_bash_completes_commands_options_and_choices(capsys, tmp_path):
     script = completion(capsys, "qsim", "bash")
-    (tmp_path / "reading.txt").touch()
     assert complete(script, "qsim", "re", cwd=tmp_path) == ["render", "recipes", "report"]
     assert complete(script, "qsim", "render", "--fr", cwd=tmp_path) == ["--frames", "--frame-rate"]
     assert complete(script, "qsim", "calibrate", "--model", "", cwd=tmp_path) == ["qis", "spad"]
     assert complete(script, "qsim", "validate", "s", cwd=tmp_path) == ["sensor"]
-    assert complete(script, "qsim", "check", "read", cwd=tmp_path) == ["reading.txt"]
-    script = completion(capsys, "quiver", "bash")
-    assert complete(script, "quiver", "train", "--preset", "quiver-", cwd=tmp_path) == ["quiver-s", "quiver-s-1m"]
 
 
-@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
-def test_bash_completes_scenes_sensors_recipes_and_methods_or_files(capsys, tmp_path):
-    script = completion(capsys, "qsim", "bash")
-    for name in ("fan_of_mine.py", "spad.toml", "starter_of_mine.toml"):
-        (tmp_path / name).touch()
-    assert complete(script, "qsim", "render", "fa", cwd=tmp_path) == ["fan"]
-    assert complete(script, "qsim", "render", "fan_", cwd=tmp_path) == ["fan_of_mine.py"]
-    assert complete(script, "qsim", "sense", "--sensor", "spad-", cwd=tmp_path) == ["spad-320x240"]
-    assert complete(script, "qsim", "sense", "--sensor", "spad.", cwd=tmp_path) == ["spad.toml"]
-    assert complete(script, "qsim", "generate", "st", cwd=tmp_path) == ["starter"]
-    assert complete(script, "qsim", "recipes", "--print", "de", cwd=tmp_path) == ["demo"]
-    assert complete(script, "qsim", "tradeoff", "gea", cwd=tmp_path) == ["gears"]
-    script = completion(capsys, "quiver", "bash")
-    assert complete(script, "quiver", "restore", "--method", "mo", cwd=tmp_path) == ["moment"]
-    assert complete(script, "quiver", "evaluate", "--methods", "naive,m", cwd=tmp_path) == [
-        "naive,moment",
-        "naive,mergenet",
-    ]
-    assert complete(script, "quiver", "evaluate", "--methods", "al", cwd=tmp_path) == ["all"]
+@pytest.mark.parametrize(
+    ("program", "words", "offered"),
+    [
+        ("qsim", "render fa", "fan"),
+        ("qsim", "sense --sensor spad-", "spad-320x240"),
+        ("qsim", "generate st", "starter"),
+        ("qsim", "recipes --print de", "demo"),
+        ("qsim", "tradeoff gea", "gears"),
+        ("quiver", "restore --method mo", "moment"),
+        ("quiver", "evaluate --methods naive,m", "naive,moment"),
+        ("quiver", "evaluate --methods al", "all"),
+        ("quiver", "train --start me", "mergenet"),
+    ],
+)
+def test_shells_are_told_the_names_of_scenes_sensors_recipes_and_methods(capsys, program, words, offered):
+    """What the scripts ask the program for, and files beside them."""
+    PROGRAMS[program].main(["__complete", *words.split()])
+    assert offered in capsys.readouterr().out.splitlines()
 
 
-def test_fish_completes_scenes_and_methods(capsys):
-    lines = completion(capsys, "qsim", "fish").splitlines()
-    assert any(
-        line.startswith("complete -c qsim") and "from render" in line and " -a " in line and "fan " in line
-        for line in lines
-    )
-    lines = completion(capsys, "quiver", "fish").splitlines()
-    assert any("-l method " in line and " -r -a " in line and "moment" in line for line in lines)
+def test_files_are_completed_beside_names(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fan_of_mine.py").touch()
+    main(["__complete", "render", "fan_"])
+    assert "fan_of_mine.py" in capsys.readouterr().out.splitlines()
 
 
 @pytest.mark.parametrize("program", ["qsim", "quiver"])
-def test_every_help_has_an_example_that_is_understood(capsys, monkeypatch, program):
-    """And --json, --quiet, --verbose; the programs say their version."""
-    import shlex
-
-    module = {"qsim": qsim.cli.program, "quiver": quiver.cli.program}[program]
+def test_every_help_has_examples_that_are_understood(capsys, program):
+    """And --json, --quiet, --verbose, within 80 columns but for examples; the programs say their version."""
+    module = PROGRAMS[program]
     assert module.main(["--version"]) == 0
     assert capsys.readouterr().out == f"{program} {qsim.__version__}\n"
-    module.main(["--help"])
-    commands = re.findall(r"^    ([a-z-]+)(?:  +\S|$)", capsys.readouterr().out, re.MULTILINE)
-    for command in commands:
-        module.main([command, "--help"])
-        text = capsys.readouterr().out
+    for command in module.PROGRAM.commands:
+        assert module.main([command, "--help"]) == 0
+        text, _, examples = capsys.readouterr().out.partition("example:\n")
         assert all(option in text for option in ("--json", "--quiet", "--verbose"))
-        examples = text.split("example:\n")[1].strip().split("\n")
-        for line in examples:
+        assert max(map(len, text.splitlines())) <= 80
+        for line in examples.strip().split("\n"):
             words = shlex.split(line.strip())
             words = words[: next((i for i, word in enumerate(words) if word in (">", ">>")), len(words))]
             assert words[0] in (program, "torchrun")
             if words[0] == program:
                 assert words[1] == command
-                with monkeypatch.context() as patch:
-                    patch.setattr(module, "run", lambda parser, argv: parser.parse_args(argv))
-                    assert module.main(words[1:]) is not None
+                found, _ = module.PROGRAM.read(words[1:])
+                assert found is module.PROGRAM.declared(command)
 
 
 @pytest.mark.parametrize("program", ["qsim", "quiver"])
 def test_every_option_is_in_every_script(capsys, program):
-    """The options that the helps show, read from the helps."""
-    cli = {"qsim": qsim.cli.program.main, "quiver": quiver.cli.program.main}[program]
-    scripts = {shell: completion(capsys, program, shell) for shell in ("bash", "zsh", "fish")}
-    cli(["--help"])
-    commands = re.findall(r"^    ([a-z-]+)(?:  +\S|$)", capsys.readouterr().out, re.MULTILINE)
-    assert len(commands) >= 7
-    for command in commands:
-        cli([command, "--help"])
-        for option in re.findall(r"^  (?:-\w, |-\w \S+, )?--([a-z-]+)", capsys.readouterr().out, re.MULTILINE):
-            assert f"--{option}" in scripts["bash"]
-            assert f"--{option}" in scripts["zsh"]
-            assert any(f"from {command}" in line and f"-l {option} " in line for line in scripts["fish"].split("\n"))
+    scripts = [completion(capsys, program, shell) for shell in ("bash", "zsh", "fish")]
+    known = PROGRAMS[program].PROGRAM
+    for command in known.commands:
+        for setting in known.declared(command).settings:
+            if not setting.positional:
+                assert all(setting.option in script for script in scripts), (command, setting.option)
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
@@ -137,7 +122,7 @@ def test_scripts_are_valid_where_the_shell_is_there(capsys, tmp_path, shell):
 
 @pytest.mark.parametrize("program", ["qsim", "quiver"])
 def test_a_program_alone_prints_its_help(capsys, program):
-    assert {"qsim": main, "quiver": quiver.cli.program.main}[program]([]) == 0
+    assert PROGRAMS[program].main([]) == 0
     found = capsys.readouterr()
     assert found.out.startswith(f"usage: {program} ")
     assert not found.err
@@ -251,7 +236,7 @@ def test_a_bar_names_the_work_before_the_first_frame(capsys, monkeypatch):
 
 def test_quiet_and_verbose_exclude_each_other(capsys):
     assert main(["doctor", "-q", "-v"]) == 2
-    assert "not allowed with argument" in capsys.readouterr().err
+    assert "not allowed with --quiet" in capsys.readouterr().err
 
 
 def test_warnings_are_one_line_and_quiet_has_none(tmp_path, monkeypatch, capsys):
@@ -283,27 +268,14 @@ def test_verbose_says_time_and_memory_and_shows_the_traceback(tmp_path, capsys):
 
 
 def test_a_quiet_bar_shows_nothing(capsys):
-    token = console.quiet.set(True)
+    token = console._running.set(console.Running(printing=Printing(quiet=True)))
     try:
         with console.bar("rendering") as progress:
             progress(1, 2)
         console.note("working")
     finally:
-        console.quiet.reset(token)
+        console._running.reset(token)
     assert capsys.readouterr().err == ""
-
-
-def test_values_of_options_obey_the_rules_of_recipes():
-    from argparse import ArgumentTypeError
-
-    from qsim import checks
-
-    assert checked(checks.whole)("12") == 12
-    assert checked(checks.psnr)("40") == 40.0
-    assert checked(checks.positive)("20e-6") == 20e-6
-    for wrong in ("12.5", "x", "", "nan"):
-        with pytest.raises(ArgumentTypeError, match="expected a whole number"):
-            checked(checks.whole)(wrong)
 
 
 def test_ctrl_c_of_a_command_that_starts_again(tmp_path):

@@ -10,16 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from option_rows import parser_of
 
 import qsim.cli.program
 import quiver.cli.program
 from qsim.cli import demo
 
-PARSERS = {
-    "qsim": parser_of(qsim.cli.program.main, qsim.cli.program),
-    "quiver": parser_of(quiver.cli.program.main, quiver.cli.program),
-}
+PROGRAMS = {"qsim": qsim.cli.program.PROGRAM, "quiver": quiver.cli.program.PROGRAM}
 
 
 @pytest.fixture
@@ -30,12 +26,12 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, list[str]]]:
     def parse(words: list[str], capture: bool) -> str:
         program = words[2]
         arguments = words[3:]
-        args = PARSERS[program].parse_args(arguments)
+        _, values = PROGRAMS[program].read(arguments)
         found.append((program, arguments))
-        if args.command == "generate":
-            args.output.mkdir()
+        if arguments[0] == "generate":
+            values["output"].mkdir()
             jobs = {"a": {"split": "train"}, "b": {"split": "test"}}
-            (args.output / "dataset.json").write_text(json.dumps({"jobs": jobs}))
+            (values["output"] / "dataset.json").write_text(json.dumps({"jobs": jobs}))
         return "{}"
 
     monkeypatch.setattr(demo, "call", parse)
@@ -50,8 +46,8 @@ def test_every_step_is_a_command_of_the_programs(ran, tmp_path: Path):
         *("quiver restore", "quiver evaluate", "quiver evaluate", "qsim report"),
     ]
     assert ran[0][1][1] == "demo"
-    train = PARSERS["quiver"].parse_args(ran[1][1])
-    assert (train.preset, train.start, train.minutes) == ("mergenet", "mergenet", 2)
+    _, train = PROGRAMS["quiver"].read(ran[1][1])
+    assert (train["network"], train["start"], train["minutes"]) == ("mergenet", "mergenet", 2)
     assert np.load(tmp_path / "ball_12bit.npy").shape == (15, 384, 384)
     assert all(Path(word).is_file() for _, words in ran for word in words if word.endswith(".npz"))
 

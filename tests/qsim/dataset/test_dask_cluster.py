@@ -249,7 +249,12 @@ def test_options_that_are_not_given_are_the_defaults(options_used: list[Options]
 
 
 @pytest.mark.parametrize(
-    ("given", "text"), [("--gpus 1", "needs --cluster"), ("--gpus -1", "0 or more"), ("--gpus nan", "0 or more")]
+    ("given", "text"),
+    [
+        ("--gpus 1", "needs --cluster"),
+        ("--gpus -1", "expected a number from 0"),
+        ("--gpus nan", "expected a number from 0"),
+    ],
 )
 def test_gpus_are_the_clusters(options_used: list[Options], capsys: pytest.CaptureFixture[str], given: str, text: str):
     assert qsim.cli.program.main(["generate", "r.toml", *given.split()]) == 2

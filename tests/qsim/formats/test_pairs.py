@@ -77,7 +77,7 @@ def test_sums_of_frames_and_clips_without_truth_have_no_flow(tmp_path: Path):
         ("lit foreign.h5 --window 2 --force", "foreign.h5: was not written by `qsim convert`"),
         ("lit foreign.h5 --window 2", "foreign.h5: exists; name another"),
         ("lit/streams/s.json p.h5", "pairs are made of a data set or a clip"),
-        ("lit p.h5 --window 0", "expected a whole number of at least 1"),
+        ("lit p.h5 --window 0", "expected a whole number from 1"),
     ],
 )
 def test_what_cannot_be_written_is_one_line(tmp_path: Path, monkeypatch, capsys, words: str, message: str):

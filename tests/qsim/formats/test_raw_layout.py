@@ -1,5 +1,6 @@
 """Tests raw frames of any stated layout against an encoder of whole numbers, and Photron's description."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -173,6 +174,6 @@ def test_convert_and_calibrate_read_the_same_layout(tmp_path: Path, capsys: pyte
     hints = Hints("raw", 5, 7, order="lsb", skip_bytes=16, row_padding=1)
     found = read_stack(path, bits=3, exposure=1e-3, photons=0.0, hints=hints)
     assert np.array_equal(found.total, frames.sum(axis=0))
-    stream = importing.to_stream(importing.read(path, Hints("raw", 5, 7, 3, order="lsb", skip_bytes=16, row_padding=1)),
+    stream = importing.to_stream(importing.read(path, replace(hints, bits=3)),
                                  tmp_path / "t", CAPTURE)  # fmt: skip
     np.testing.assert_array_equal(stream.codes(), frames)

@@ -14,7 +14,7 @@ import pytest
 import torch
 from clips import write_clip, write_dataset
 from golden import TINY, fill_by_rule, published_state
-from option_rows import Acts, Refused, Row, Run, check, loudness, names, names_of, options, parser_of, stdout
+from option_rows import Acts, Refused, Row, Run, check, loudness, names, names_of, options, stdout
 from safetensors.numpy import load_file
 
 from qsim import figures
@@ -615,15 +615,14 @@ def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_option_has_a_row():
     """Read from the parsers: an option without a row fails here, and so does a row without an option."""
-    assert set(ROWS) == set(options(parser_of(program.main, program), ""))
+    assert set(ROWS) == set(options(program.PROGRAM))
 
 
 def test_every_row_shows_its_option():
-    parser = parser_of(program.main, program)
     for (command, option), rows in ROWS.items():
         assert rows
         for row in rows:
-            assert row.option.split()[0] in names_of(parser, command, option), row
+            assert row.option.split()[0] in names_of(program.PROGRAM, command, option), row
             assert row.command.removeprefix("only a note: ").startswith(command), row
 
 

@@ -16,9 +16,9 @@ from golden import published_state
 from safetensors.torch import save_file
 
 from qsim import colour
-from qsim.cli.options import memory_size
 from qsim.cli.program import main as qsim_main
 from qsim.locks import Lock
+from qsim.words import memory_size
 from quiver.cli.program import main
 from quiver.data.clips import open_clips
 
@@ -158,7 +158,9 @@ def test_missing_things_are_named(capsys, tmp_path, tiny_dataset, clip):
     )
     assert "no such file" in mistake(capsys, "evaluate", "--static", gone)
     assert "give a data set" in mistake(capsys, "evaluate")
-    assert "--steps N or --minutes M" in mistake(capsys, "train", tiny_dataset, "-o", tmp_path / "r")
+    assert "give a training length, as --steps or as --minutes" in mistake(
+        capsys, "train", tiny_dataset, "-o", tmp_path / "r"
+    )
     assert "choose one of its streams" in mistake(
         capsys, "restore", clip, "-o", tmp_path / "v.npy", "--method", "moment"
     )
@@ -169,9 +171,9 @@ def test_missing_things_are_named(capsys, tmp_path, tiny_dataset, clip):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--ppp", "nan"], "expected a number above 0, got 'nan'"),
-        (["--ppp", "-3"], "expected a number above 0, got '-3'"),
-        (["--bits", "0"], "expected a whole number of at least 1, got '0'"),
+        (["--ppp", "nan"], "expected a number from 1e-06 to 1e+06, got 'nan'"),
+        (["--ppp", "-3"], "expected a number from 1e-06 to 1e+06, got '-3'"),
+        (["--bits", "0"], "expected a whole number from 1 to 16, got '0'"),
         (["--memory", "lots"], "expected a size such as 2GB"),
         (["--mode", "fast"], "fast"),
         (["--sensor", "quiver-fysical", "--ppp", "3"], "quiver-fysical"),

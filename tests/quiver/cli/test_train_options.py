@@ -41,13 +41,13 @@ def told(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     ("words", "message"),
     [
         (["--minutes", "1", "--validate-every", "5"], "--validate-every: counts steps of a run with --steps"),
-        ([*FAST, "--threads", "0"], "argument --threads: expected a whole number of at least 1, got '0'"),
+        ([*FAST, "--threads", "0"], "argument --threads: expected a whole number from 1, got '0'"),
         ([*FAST, "--threads", "9999"], "--threads 9999: this machine has"),
         ([*FAST, "--crop", "18"], "--crop 18: this network needs a multiple of 4"),
         ([*FAST, "--sensor", "spad-320x240,nosuch"], "unknown sensor 'nosuch'"),
         ([*FAST, "--sensor", "nosuch.toml"], "nosuch.toml: no such sensor file"),
         ([*FAST, "--bits", "17"], "17"),
-        ([*FAST, "--sensor", "a,,b"], "expected names with commas between them"),
+        ([*FAST, "--sensor", "a,,b"], "expected values with commas between them"),
     ],
 )
 def test_what_cannot_act_is_refused(capsys, tiny_dataset, tmp_path, monkeypatch, words, message):

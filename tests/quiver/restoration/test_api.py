@@ -19,8 +19,8 @@ def test_the_command_and_the_call_have_one_default_method(inputs, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"mode": "streaming"}, "--mode: acts on networks, and moment is classical"),
-        ({"device": "cpu"}, "--device: acts on networks"),
+        ({"mode": "streaming"}, "mode: acts on networks, and moment is classical"),
+        ({"device": "cpu"}, "device: acts on networks"),
     ],
 )
 def test_the_call_refuses_what_it_would_ignore(inputs, changes, message):
@@ -37,7 +37,7 @@ def test_the_call_refuses_what_it_would_ignore(inputs, changes, message):
         ({"exposure": float("nan")}, "exposure= is in seconds"),
         ({"sensor": "quiver-physical"}, "sensor= is a sensor, as qsim.load_sensor"),
         ({"method": None}, "method= is a name"),
-        ({"method": "mergenet", "device": "gpu"}, "device 'gpu'; known are auto, cpu, cuda"),
+        ({"method": "mergenet", "device": "gpu"}, "device: expected one of auto, cpu, cuda, got 'gpu'"),
         ({"defects": np.where(np.eye(8) > 0, 0.3, 0.0)}, "defects=: a map of defective pixels is"),
         ({"defects": np.full((8, 8), np.nan)}, "defects=: a map of defective pixels is"),
         ({"defects": np.full((8, 8), 255, np.uint8)}, "defects=: a map of defective pixels is"),

@@ -38,9 +38,9 @@ def test_weights_state_a_sensor_without_its_folder(tmp_path, sensor, found):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"steps": None}, "give a training length: --steps N or --minutes M"),
-        ({"steps": 0}, "--steps must be above 0"),
-        ({"learning_rate": math.nan}, "--learning-rate must be above 0, got nan"),
+        ({"steps": None}, "give a training length, as steps= or as minutes="),
+        ({"steps": 0}, "steps: expected a whole number from 1, got 0"),
+        ({"learning_rate": math.nan}, "learning_rate: expected a number above 0, got nan"),
         ({"loss": "l3"}, "no loss is called 'l3'; known are published, paper, l1"),
     ],
 )

@@ -1,0 +1,68 @@
+"""Declares the settings of a restoration: which codes, of which sensor in which light, by which method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from qsim.kinds import Bits, Light, Positive, Seed, Text, Whole
+from qsim.settings import setting
+from quiver.data.illumination import sensor_names
+from quiver.restoration.interface import DEFAULT_METHOD
+
+
+def method_names() -> Iterable[str]:
+    """Return the methods that need no training, for shells to complete."""
+    from quiver.restoration import restorers
+
+    return restorers.method_names()
+
+
+@dataclass(frozen=True)
+class RestoreSettings:
+    """What is restored, and where the result is written."""
+
+    source: Annotated[
+        Path,
+        setting(
+            "stream (.npy with its .json), clip folder, bare .npy array, or (with -o OUT.zip) cubes of the challenge",
+            positional=True,
+        ),
+    ]
+    output: Annotated[
+        Path,
+        setting(
+            ".npy to write, or .zip: the pictures of a submission to the challenge; a .json appears beside it",
+            short="o",
+        ),
+    ]
+    method: Annotated[
+        Text,
+        setting(
+            "classical method, shipped weights, weights file or run folder; auto: mergenet, or the classical method "
+            "that was measured to be better at this sensor, depth and light",
+            known=method_names,
+        ),
+    ] = DEFAULT_METHOD
+    stream: Annotated[Text | None, setting("stream of a clip to restore", unset="the only one")] = None
+    sensor: Annotated[
+        Text | None,
+        setting("a name of `qsim doctor --devices`, or a .toml file", unset="quiver-physical", known=sensor_names),
+    ] = None
+    ppp: Annotated[Light | None, setting("mean photons per pixel and exposure", unset="that of the stored stream")] = (
+        None
+    )
+    bits: Annotated[Bits | None, setting("bits per code", unset="3; of a .toml file its own")] = None
+    seed: Annotated[Seed | None, setting("seed of the noise, if a clip is sensed now", unset="0")] = None
+    width: Annotated[Whole | None, setting("bare array: packed binary planes of this many pixels per row")] = None
+    planes: Annotated[Whole | None, setting("packed planes and cubes: 2^b - 1 are summed to one code", unset="1")] = (
+        None
+    )
+    frame_rate: Annotated[Positive | None, setting("bare array: codes per second", unset="2000")] = None
+    defects: Annotated[
+        Path | None, setting("map of defective pixels, .npy [H, W], true where hot or dead: they are filled")
+    ] = None
+    strict: Annotated[bool, setting("networks: refuse a stream outside their measured domain")] = False
+    force: Annotated[bool, setting("replace an existing result")] = False
