@@ -33,7 +33,8 @@ class CodeTable:
 
     def __init__(self, sensor: Distribution, exposure: float) -> None:
         """Fill the table. `ValueError` for a sensor whose codes do not grow with light (a paralyzable counter)."""
-        self.sensor, self.exposure = sensor, exposure
+        self.sensor = sensor
+        self.exposure = exposure
         brightest = sensor.white(exposure)
         while sensor.cdf(np.array([brightest]), exposure)[0, -2] > 1e-4 and brightest < 64 * sensor.white(exposure):
             brightest *= 1.25

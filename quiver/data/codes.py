@@ -260,7 +260,8 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
 
 def stream_codes(stream: Stream) -> Codes:
     """Return the codes of a stored stream; its dead and hot pixels, where it states them, are filled."""
-    meta, (bad, sensor) = stream.meta, defects.of_stream(stream)
+    meta = stream.meta
+    bad, sensor = defects.of_stream(stream)
     codes = Codes(
         stream.name,
         stream.shape,

@@ -48,7 +48,8 @@ class Filler:
 
         if bad.all():
             raise ValueError(f"all {bad.size} pixels are marked as defective; the map is true at defective pixels")
-        self.bad, self.picks = bad, picks
+        self.bad = bad
+        self.picks = picks
         good = np.argwhere(~bad)
         count = min(NEIGHBOURS, len(good))
         distance, index = cKDTree(good).query(np.argwhere(bad), k=range(1, count + 1))

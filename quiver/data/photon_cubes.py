@@ -44,7 +44,11 @@ def plane_bits(planes: int) -> int:
         return bits
     lower = 2 ** ((planes + 1).bit_length() - 1) - 1
     higher = 2 ** (planes + 1).bit_length() - 1
-    near = 1 if planes < 1 else 65535 if higher > 65535 else f"{lower} or {higher}"
+    near = f"{lower} or {higher}"
+    if planes < 1:
+        near = "1"
+    elif higher > 65535:
+        near = "65535"
     raise ValueError(f"planes: a b-bit code sums 2^b - 1 binary planes, got {planes}; use {near}")
 
 

@@ -103,7 +103,8 @@ class StreamWindows(Dataset[dict[str, Any]]):
                 f"{settings.crop} x {settings.crop} px; choose a smaller --crop or fewer --frames"
             )
         law_of(codes)
-        self.codes, self.settings = codes, settings
+        self.codes = codes
+        self.settings = settings
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how a worker makes the same windows: it opens the stored stream again."""

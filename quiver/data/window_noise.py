@@ -97,7 +97,9 @@ def window_codes(
     length, height, width = clip.shape
     before = length - place.start - frames if place.backwards else place.start
     lead = min(array.lead(NEGLIGIBLE), before)
-    (dy, dx), last, reach = place.drift, frames - 1, array.reach
+    dy, dx = place.drift
+    last = frames - 1
+    reach = array.reach
     y, x = (sorted((first, first + last * way)) for first, way in zip((place.y, place.x), (dy, dx), strict=True))
     top = min(reach, y[0])
     left = min(reach, x[0])

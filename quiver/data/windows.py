@@ -105,7 +105,10 @@ class Windows(Dataset[dict[str, Any]]):
         in every epoch.
         """
         check_clips(clips, settings)
-        self.clips, self.settings, self.fixed, self.prepare = tuple(clips), settings, fixed, prepare
+        self.clips = tuple(clips)
+        self.settings = settings
+        self.fixed = fixed
+        self.prepare = prepare
         if settings.lights is None:
             self.noise = choose(clips)
         else:
@@ -130,7 +133,8 @@ class Windows(Dataset[dict[str, Any]]):
         """Return where sample n lies, without reading it."""
         if self.fixed:
             return self._middle(n % self.length)
-        settings, (epoch, index) = self.settings, divmod(n, self.length)
+        settings = self.settings
+        epoch, index = divmod(n, self.length)
         clip = int(np.random.default_rng((settings.seed, epoch)).permutation(self.length)[index]) % len(self.clips)
         rng = np.random.default_rng((settings.seed, epoch, index))
         length, height, width = self.clips[clip].shape
@@ -229,7 +233,8 @@ class Windows(Dataset[dict[str, Any]]):
         """Return the expected photons of the exposed and of the sharp window, float64 [T, h, w] each, turned."""
         clip = self.clips[place.clip]
         side = self.settings.crop
-        (dy, dx), (draw, _, _) = place.drift, self._draw(place)
+        dy, dx = place.drift
+        draw, _, _ = self._draw(place)
 
         def taken(sharp: bool) -> Array:
             return np.stack(
@@ -256,7 +261,8 @@ class Windows(Dataset[dict[str, Any]]):
         clip = self.clips[place.clip]
         side = self.settings.crop
         frames = self.settings.frames
-        (dy, dx), (draw, _, _) = place.drift, self._draw(place)
+        dy, dx = place.drift
+        draw, _, _ = self._draw(place)
         i = frames - 1 - frames // 2 if place.backwards else frames // 2
         crop = (place.y + dy * i, place.x + dx * i, side, side)
         instant = {"sharp": has_sharp(clip), "diffraction": draw.diffraction}
@@ -335,7 +341,11 @@ class Batches(Sampler[list[int]]):
     """Sample numbers of batch after batch, from batch `first` on; each of `world` processes gets a separate share."""
 
     def __init__(self, batch: int, first: int, last: int, rank: int = 0, world: int = 1) -> None:
-        self.batch, self.first, self.last, self.rank, self.world = batch, first, last, rank, world
+        self.batch = batch
+        self.first = first
+        self.last = last
+        self.rank = rank
+        self.world = world
 
     def __iter__(self) -> Iterator[list[int]]:
         for step in range(self.first, self.last):

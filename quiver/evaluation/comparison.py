@@ -143,7 +143,8 @@ def restore_clip(
 
     A failure becomes the reason in the row.
     """
-    name, (precision, cut) = comparison.label(light), settings_of(method, codes)
+    name = comparison.label(light)
+    precision, cut = settings_of(method, codes)
     row = ComparisonRow(method.name, method.description, name, clip.name, scene_of(clip), precision=precision, cut=cut)
     row = replace(row, device=method.device, threads=threads.current())
     frames = scored_frames(len(clip), comparison.published)

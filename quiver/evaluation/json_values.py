@@ -19,4 +19,6 @@ def json_safe(value: Any, *, infinite: bool = False) -> Any:
 
 def number(value: Any) -> Any:
     """Return the number that `json_safe` stored with `infinite`; NaN for null."""
-    return math.nan if value is None else float(value) if isinstance(value, str) else value
+    if value is None:
+        return math.nan
+    return float(value) if isinstance(value, str) else value

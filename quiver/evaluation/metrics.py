@@ -80,7 +80,9 @@ def above_peak(target: np.ndarray, valid: np.ndarray | None = None) -> float:
     stack = _stack("target", target)
     over = stack > 1
     keep = _kept(valid, stack)
-    return float(over.mean() if keep is None else over[keep].mean() if keep.any() else nan)
+    if keep is None:
+        return float(over.mean())
+    return float(over[keep].mean()) if keep.any() else nan
 
 
 def above_peak_warning(what: str, share: float) -> str:

@@ -131,7 +131,8 @@ def _tap_samples(image: Tensor, y: Tensor, x: Tensor) -> Tensor:
 
 def _contract(samples: Tensor, weight: Tensor, part: slice) -> Tensor:
     """Sum over channels and taps: [N, G, C/G, k, oh, ow] x [Co, C/groups, kh, kw] -> [N, Co, oh, ow]."""
-    count, height, width = samples.shape[0], *samples.shape[4:]
+    count = samples.shape[0]
+    height, width = samples.shape[4:]
     out = weight.shape[0]
     fan = weight.shape[1]
     channels = samples.shape[1] * samples.shape[2]

@@ -60,7 +60,9 @@ def ablated(config: Config, row: str) -> Config:
     smaller = replace(config, pre_denoiser=pre_denoiser, flow=flow, multi_scale=multi_scale)
     growth = config.cell_growth or 2 * config.channels
     while parameter_count(smaller) < wanted:
-        smaller, before, growth = replace(smaller, cell_growth=growth + 1), smaller, growth + 1
+        before = smaller
+        growth += 1
+        smaller = replace(smaller, cell_growth=growth)
         if abs(parameter_count(before) - wanted) < abs(parameter_count(smaller) - wanted):
             return before
     return smaller

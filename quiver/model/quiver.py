@@ -140,7 +140,8 @@ class QUIVER(nn.Module):
         self, frames: Tensor, denoised: Tensor, flows: Sequence[Tensor]
     ) -> tuple[dict[int, Tensor], dict[int, Tensor], list[Tensor]]:
         """Return R1 and R2 of the centre frames by index, and the recurrent cell's entries of all frames."""
-        length, (height, width) = frames.shape[1], frames.shape[3:]
+        length = frames.shape[1]
+        height, width = frames.shape[3:]
         images = (frames, *(resize(frames, height // k, width // k) for k in (2, 4)))
         noisy = _per_frame(self.noisy_features, neighbourhoods(frames))
         clean = _per_frame(self.denoised_features, neighbourhoods(denoised))
@@ -159,7 +160,8 @@ class QUIVER(nn.Module):
             for t, (full, half, entry) in enumerate(zip(*by_time, strict=True), start=len(entries)):
                 entries.append(entry)
                 if RADIUS <= t < length - RADIUS:
-                    r1[t], r2[t] = full, half
+                    r1[t] = full
+                    r2[t] = half
         return r1, r2, entries
 
     def recur(self, entries: Sequence[Tensor]) -> list[Tensor]:

@@ -213,7 +213,9 @@ def _trained(text: str | None) -> tuple[Illumination, ...]:
 
 
 def _listed(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [] if value is None else [value]
+    if isinstance(value, list):
+        return value
+    return [] if value is None else [value]
 
 
 def forget_damaged(weights: Path) -> None:
@@ -293,7 +295,10 @@ def _too_short(name: str, frames: int, bits: int) -> str | None:
     if frames >= (BINARY_FRAMES if bits == 1 else FRAMES):
         return None
     stream = "one frame" if frames == 1 else f"{frames} frames"
-    off = 30 if frames == 1 else 12 if bits == 1 else 5
+    if frames == 1:
+        off = 30
+    else:
+        off = 12 if bits == 1 else 5
     return f"{name} was never trained on {stream} of {bits} bit, and its brightness may be wrong by up to {off} %"
 
 

@@ -47,7 +47,8 @@ def by_colour(codes: Codes) -> list[Codes]:
     """Return the codes of the first place of every colour, each with its own light; of one band the stream itself."""
     if codes.colour is None:
         return [codes]
-    (rows, columns), (_, height, width) = codes.colour.tile, codes.shape
+    rows, columns = codes.colour.tile
+    _, height, width = codes.shape
     found: dict[str, Codes] = {}
     for i, j in np.ndindex(min(rows, height), min(columns, width)):
         found.setdefault(codes.colour.mask[i][j], _place(codes, i, j))
@@ -57,7 +58,8 @@ def by_colour(codes: Codes) -> list[Codes]:
 def _place(codes: Codes, i: int, j: int) -> Codes:
     """Return the codes [T, h, w] of the pixels at row i, column j of the tile, as a stream of one band."""
     assert codes.colour is not None
-    (length, height, width), (rows, columns) = codes.shape, codes.colour.tile
+    length, height, width = codes.shape
+    rows, columns = codes.colour.tile
 
     def read(start: int, stop: int) -> Array:
         return np.ascontiguousarray(codes.read(start, stop)[:, i::rows, j::columns])

@@ -189,7 +189,10 @@ class Trainer:
     ) -> None:
         settings = run.settings
         self.system = system
-        self.model, self.run, self.fixed, self.process = model.to(process.device).train(), run, fixed, process
+        self.model = model.to(process.device).train()
+        self.run = run
+        self.fixed = fixed
+        self.process = process
         self.optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
         self.state = run.load(model, self.optimiser)
         objective = Objective(model, system.loss, settings)
@@ -200,8 +203,10 @@ class Trainer:
         )
         self.low = precision_of(settings, process.device) == "bfloat16"
         self.board: Board | None = None
-        self.started, self.saved = time.monotonic() - self.state.elapsed, time.monotonic()
-        self.loss, self.rate = math.nan, math.nan  # of the last step
+        self.started = time.monotonic() - self.state.elapsed
+        self.saved = time.monotonic()
+        self.loss = math.nan  # of the last step
+        self.rate = math.nan
         self.validation = 0.0  # s, duration of the last one
         self.validated = False
         self.stored = run.checkpoint.exists()
@@ -223,7 +228,8 @@ class Trainer:
         if self.process.any(not math.isfinite(self.loss + norm)):
             self._fail(batch, norm)
         self.optimiser.step(self.rate)
-        state.step, state.elapsed = state.step + 1, self.process.from_leader(time.monotonic() - self.started)
+        state.step = state.step + 1
+        state.elapsed = self.process.from_leader(time.monotonic() - self.started)
         if self.board is not None:
             self.board.step(state, self.loss, norm, self.rate)
 

@@ -89,7 +89,9 @@ class Run:
     """Folder of a run. `conditions` are values by the keys of CONDITIONS, stored beside the settings."""
 
     def __init__(self, settings: Settings, conditions: Mapping[str, Any] | None = None) -> None:
-        self.settings, self.folder, self.conditions = settings, Path(settings.out), dict(conditions or {})
+        self.settings = settings
+        self.folder = Path(settings.out)
+        self.conditions = dict(conditions or {})
         self.checkpoint = self.folder / "checkpoint.pt"
 
     @contextlib.contextmanager

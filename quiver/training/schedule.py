@@ -80,7 +80,8 @@ def validation_due(settings: Settings, state: State) -> bool:
     """Return whether a validation is due: every `validate_every` steps, or after every tenth of a timed run."""
     if settings.steps is not None:
         return state.step % settings.validate_every == 0
-    before, state.tenths = state.tenths, int(10 * share_used(settings, state))
+    before = state.tenths
+    state.tenths = int(10 * share_used(settings, state))
     return state.tenths > before
 
 
@@ -92,8 +93,10 @@ def time_is_up(settings: Settings, state: State, validation: float) -> bool:
 def note_plateau(patience: int, state: State, psnr: float) -> None:
     """Count a validation, and halve the rate after more than `patience` in a row without a relative gain of 1e-4."""
     if state.plateau_best == -math.inf or psnr > state.plateau_best * (1 + PLATEAU_GAIN):
-        state.plateau_best, state.plateau_bad = psnr, 0
+        state.plateau_best = psnr
+        state.plateau_bad = 0
         return
     state.plateau_bad += 1
     if state.plateau_bad > patience:
-        state.halvings, state.plateau_bad = state.halvings + 1, 0
+        state.halvings = state.halvings + 1
+        state.plateau_bad = 0

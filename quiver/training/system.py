@@ -86,7 +86,9 @@ class Objective(nn.Module):
 
     def __init__(self, network: nn.Module, loss: Loss, settings: Settings) -> None:
         super().__init__()
-        self.network, self.loss, self.settings = network, loss, settings
+        self.network = network
+        self.loss = loss
+        self.settings = settings
 
     def forward(self, batch: Batch, share: float) -> Tensor:
         """Return the loss of a batch, a scalar; `share` of the run is over."""

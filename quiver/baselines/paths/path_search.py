@@ -53,7 +53,8 @@ def search(frames: Tensor, offsets: Sequence[int], scale: int, speed: float) -> 
 
 def neighbours(frames: Tensor, offsets: Sequence[int], velocity: Tensor, scale: int) -> Tensor:
     """Return for each cell the velocity [2, h, w] that fits best: its own, or that of a cell of scale 8 beside it."""
-    step, (height, width) = SCALES[0] // scale, frames.shape[1:]
+    step = SCALES[0] // scale
+    height, width = frames.shape[1:]
     grown = functional.pad(velocity[None], (step,) * 4, mode="replicate")[0]
     moves = ((0, 0), (0, step), (0, -step), (step, 0), (-step, 0))
     choices = [grown[:, step + y : step + y + height, step + x : step + x + width] for y, x in moves]
@@ -100,7 +101,9 @@ def _add_misfits(
     """Add the misfit of a frame moved by every velocity to sums [2 most + 1, 2 most + 1, h, w], and 1 to `inside`,
     where the moved place lies in the frame.
     """
-    (height, width), count, far = reference.shape, 2 * most + 1, abs(offset) * most
+    height, width = reference.shape
+    count = 2 * most + 1
+    far = abs(offset) * most
     fine, start = _in_steps(frame, far)
     line = fine.shape[1]
     part = torch.tensor([offset * (u - most) % PARTS * STEP for u in range(count)])

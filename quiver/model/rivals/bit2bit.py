@@ -122,7 +122,8 @@ class Bit2Bit(nn.Module):
 
     def output(self, seen: Tensor, share: Tensor) -> Tensor:
         """Seen photons [B, T, 1, H, W] and the share that they are [B] -> logit or log-brightness [B, T, 1, H, W]."""
-        count, (height, width) = seen.shape[1], seen.shape[-2:]
+        count = seen.shape[1]
+        height, width = seen.shape[-2:]
         order = reflected(0, -(-count // self.multiple) * self.multiple, count)
         volume = pad_space(seen, self.multiple)[:, order].transpose(1, 2)  # [B, 1, T, H, W]
         channels = [torch.sin(volume * 10.0**-i) for i in range(FREQUENCIES)]

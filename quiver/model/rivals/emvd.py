@@ -78,8 +78,10 @@ class EMVD(nn.Module):
         self.multiple = 2**SCALES * (2 if config.space_to_depth else 1)  # px that divide height and width inside
         self.takes_variance = not config.as_published
         colour = _colour(0.2764 if config.as_published else 0.2784)
-        self.ct, self.cti = Colour(colour), Colour(colour.T)
-        self.ft, self.fti = Analysis(), Synthesis()
+        self.ct = Colour(colour)
+        self.cti = Colour(colour.T)
+        self.ft = Analysis()
+        self.fti = Synthesis()
         self.vd, self.md1, self.md0 = (Scale(config, scale) for scale in (2, 1, 0))
         self.refine = SmallNet(2 * BANDS * IMAGE + 1, config.width, 1, sigmoid=True)
 
@@ -168,7 +170,8 @@ class NoiseMap(nn.Module):
     def __init__(self, config: EMVDConfig, scale: int) -> None:
         """Keep the factors of the band, or the published constants."""
         super().__init__()
-        self.as_published, (self.slope, self.offset) = config.as_published, config.published_noise
+        self.as_published = config.as_published
+        self.slope, self.offset = config.published_noise
         self.gain = 4.0 * 2**scale  # of the low-pass band: two by colour, two by every transform
         self.correlation = 1.0 if config.space_to_depth else 4.0  # copies add up to a larger variance
 

@@ -62,7 +62,8 @@ class FastDVDnet(nn.Module):
         """Make the network of a configuration; the published sizes by default."""
         super().__init__()
         self.config = config = config or FastDVDnetConfig()
-        self.first, self.second = Block(config), Block(config)
+        self.first = Block(config)
+        self.second = Block(config)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")

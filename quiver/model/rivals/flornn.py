@@ -102,7 +102,8 @@ class FloRNN(nn.Module):
         super().__init__()
         self.config = config = config or FloRNNConfig()
         self.look_ahead = config.look_ahead  # frames
-        self.forward_rnn, self.backward_rnn = RecurrentNet(config), RecurrentNet(config)
+        self.forward_rnn = RecurrentNet(config)
+        self.backward_rnn = RecurrentNet(config)
         self.d = Decoder(config)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):

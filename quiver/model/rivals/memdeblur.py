@@ -269,7 +269,8 @@ class Memory(nn.Module):
         self.value_encoder_feat = Encoder(FEATURES + width, width // 2, width, group_norm)
         projection = conv(4 * width, width, 3)
         self.key_proj = nn.ModuleDict({"key_proj": projection})
-        self.decoder_mem, self.decoder_feat = Decoder(width), Decoder(width)
+        self.decoder_mem = Decoder(width)
+        self.decoder_feat = Decoder(width)
         self.attention = Attention()
         nn.init.orthogonal_(projection.weight)
         nn.init.zeros_(projection.get_parameter("bias"))
@@ -341,9 +342,12 @@ class Bottleneck(nn.Module):
         """Make the layers; where the channels differ, the shortcut has a convolution."""
         super().__init__()
         outputs = 4 * width
-        self.conv1, self.bn1 = conv(inputs, width, 1), _norm(group_norm, width)
-        self.conv2, self.bn2 = conv(width, width, 3), _norm(group_norm, width)
-        self.conv3, self.bn3 = conv(width, outputs, 1), _norm(group_norm, outputs)
+        self.conv1 = conv(inputs, width, 1)
+        self.bn1 = _norm(group_norm, width)
+        self.conv2 = conv(width, width, 3)
+        self.bn2 = _norm(group_norm, width)
+        self.conv3 = conv(width, outputs, 1)
+        self.bn3 = _norm(group_norm, outputs)
         shortcut = [] if inputs == outputs else [conv(inputs, outputs, 1), _norm(group_norm, outputs)]
         self.downsample = nn.Sequential(*shortcut)
 
@@ -388,7 +392,8 @@ class ResidualBlock(nn.Module):
     def __init__(self, width: int) -> None:
         """Make the layers."""
         super().__init__()
-        self.conv1, self.conv2 = conv(width, width, 3), conv(width, width, 3)
+        self.conv1 = conv(width, width, 3)
+        self.conv2 = conv(width, width, 3)
         for layer in (self.conv1, self.conv2):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
             layer.weight.data.mul_(0.1)

@@ -118,7 +118,8 @@ class RVRT(nn.Module):
     def forward(self, frames: Tensor) -> Tensor:
         """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape."""
         check_frames(frames)
-        count, (height, width) = frames.shape[1], frames.shape[-2:]
+        count = frames.shape[1]
+        height, width = frames.shape[-2:]
         even = frames[:, reflected(0, count + count % CLIP, count)]
         padded = pad_space(even, QUARTER, self.least)
         restored = padded + self.rebuilt(self.features(padded))
@@ -267,7 +268,8 @@ class FrameConv(nn.Module):
         """Begin with the weights of an ordinary convolution."""
         super().__init__()
         plain = nn.Conv2d(inputs, outputs, kernel)
-        self.weight, self.bias = nn.Parameter(plain.weight.data.unsqueeze(2)), plain.bias
+        self.weight = nn.Parameter(plain.weight.data.unsqueeze(2))
+        self.bias = plain.bias
         self.stride = stride
 
     def forward(self, x: Tensor) -> Tensor:
@@ -281,7 +283,8 @@ class MLP(nn.Module):
     def __init__(self, width: int) -> None:
         """Make the layers."""
         super().__init__()
-        self.fc1, self.fc2 = nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
+        self.fc1 = nn.Linear(width, 2 * width)
+        self.fc2 = nn.Linear(2 * width, width)
 
     def forward(self, x: Tensor) -> Tensor:
         """[..., C] -> [..., C]."""
@@ -299,7 +302,8 @@ class WindowAttention(nn.Module):
         self.relative_position_bias_table = nn.Parameter(torch.zeros((2 * frames - 1) * side**2, HEADS))
         self.register_buffer("relative_position_index", relative_positions(frames))
         self.relative_position_index: Tensor
-        self.qkv_self, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.qkv_self = nn.Linear(width, 3 * width)
+        self.proj = nn.Linear(width, width)
 
     def forward(self, x: Tensor, window: tuple[int, int], regions: Tensor | None) -> Tensor:
         """Windows [N, M, n, C] of n = frames * h * w pixels, window = (h, w) <= 8 px -> [N, M, n, C].

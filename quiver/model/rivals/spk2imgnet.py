@@ -196,8 +196,11 @@ class Gate(nn.Module):
     def __init__(self, width: int) -> None:
         """Make the layers."""
         super().__init__()
-        self.conv0, self.conv1, self.conv2 = _conv(2 * width, width), _conv(width, width), _conv(width, width)
-        self.prelu0, self.prelu1 = nn.PReLU(), nn.PReLU()
+        self.conv0 = _conv(2 * width, width)
+        self.conv1 = _conv(width, width)
+        self.conv2 = _conv(width, width)
+        self.prelu0 = nn.PReLU()
+        self.prelu1 = nn.PReLU()
 
     def forward(self, aligned: Tensor, middle: Tensor) -> Tensor:
         """Features [N, width, H, W], twice -> weights [N, width, H, W], 0 ... 1."""
@@ -243,7 +246,8 @@ class Alignment(nn.ModuleDict):
             layers[f"L{level}_dcnpack_1"] = DeformableConvolution(width)
             if level < 3:
                 layers[f"L{level}_fea_conv_1"] = _conv(2 * width, width)
-        layers["cas_offset_conv1"], layers["cas_offset_conv2"] = _conv(2 * width, width), _conv(width, width)
+        layers["cas_offset_conv1"] = _conv(2 * width, width)
+        layers["cas_offset_conv2"] = _conv(width, width)
         layers["cas_dcnpack"] = DeformableConvolution(width)
         super().__init__(layers)
 

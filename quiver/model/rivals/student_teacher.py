@@ -99,7 +99,8 @@ class Student(nn.Module):
     def __init__(self, config: StudentTeacherConfig) -> None:
         """Make the layers."""
         super().__init__()
-        self.motion, self.noise = Encoder(config), Encoder(config)
+        self.motion = Encoder(config)
+        self.noise = Encoder(config)
         self.decoder = Decoder(config, encoders=2)
 
     def forward(self, frames: Tensor) -> Taught:
@@ -115,7 +116,8 @@ class Teacher(nn.Module):
     def __init__(self, config: StudentTeacherConfig) -> None:
         """Make the layers."""
         super().__init__()
-        self.encoder, self.decoder = Encoder(config), Decoder(config, encoders=1)
+        self.encoder = Encoder(config)
+        self.decoder = Decoder(config, encoders=1)
 
     def forward(self, frames: Tensor) -> Taught:
         """Eleven frames [N, 11, H, W] as this teacher sees them, H and W even -> the centre frame and features."""
@@ -166,7 +168,8 @@ class ResidualBlock(nn.Module):
     def __init__(self, width: int) -> None:
         """Make the layers."""
         super().__init__()
-        self.first, self.second = conv(width, width, 3), conv(width, width, 3)
+        self.first = conv(width, width, 3)
+        self.second = conv(width, width, 3)
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, width, h, w] -> the same shape."""
