@@ -16,7 +16,7 @@ from typing import Any
 
 from rows import LIGHTS, Budget, best_rate, converged, kept_scores, quiver
 
-from qsim.streams.sensing import sense
+from qsim.streams.storing import sense
 from quiver.data.clips import Clip, open_clips
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination

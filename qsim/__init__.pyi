@@ -23,8 +23,8 @@ from .sensor.spad import BinarySPAD as BinarySPAD
 from .sensor.spike import SpikeCamera as SpikeCamera
 from .streams.clip import Clip as Clip
 from .streams.sensing import Sensing as Sensing
-from .streams.sensing import replay as replay
-from .streams.sensing import sense as sense
+from .streams.storing import replay as replay
+from .streams.storing import sense as sense
 from .streams.stream import Stream as Stream
 
 __version__: str

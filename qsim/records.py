@@ -52,6 +52,11 @@ def convert(found: Any, kind: type[Made], where: str, *, cure: str = "") -> Made
         raise ValueError(f"{where}: is nested too deeply{advice}") from None
 
 
+def refuse_unknown(found: Any, kind: Any, where: str) -> None:
+    """Raise `ValueError` for the first key that a record of this type does not have, with the one that was meant."""
+    _refuse_unknown(found, kind, where, "", "")
+
+
 def plain(record: Any, *, complete: bool = False) -> Any:
     """Return a record as the values that JSON and TOML hold; fields at their default are left out unless `complete`."""
     if dataclasses.is_dataclass(record) and not isinstance(record, type):

@@ -272,43 +272,6 @@ CLIP: Table = {
         )
     },
 }
-STREAM: Table = {
-    "shape": SHAPE,
-    "bits": expected("a whole number from 1 to 16", lambda value: type(value) is int and 1 <= value <= 16),
-    "width": WHOLE,
-    "sensor": {"model": TEXT},
-    "ppp_factor or null": POSITIVE,
-    "exposure": POSITIVE,
-    "frame_rate": POSITIVE,
-    "ppp, if any": LIGHT,
-    "ppp_target, if any": POSITIVE,
-    "lux_target, if any": POSITIVE,
-    "mean_photons_before, if any": LIGHT,
-    "equivalent_lux_555nm, if any": LIGHT,
-    "seed, if any": COUNT,
-    "clip_key, if any": COUNT,
-    "planes_per_code, if any": WHOLE,
-    "diffraction, if any": FLAG,
-    "code_model, if any": TEXT,
-    "clip, if any": TEXT,
-    "sensor_name, if any": TEXT,
-    "sha256, if any": DIGEST,
-    "orientation, if any": TEXT,
-    "source, if any": OBJECT,
-    "times, if any": TIMES,
-    "defects, if any": OBJECT,
-    "rows, if any": {"delay": POSITIVE, "order": TEXT},
-    "colour, if any": OBJECT,
-    "origin, if any": PLACE,
-    "exposures, if any": expected(
-        "shares from 1e-6 to 1",
-        lambda value: list_of(lambda v: is_number(v) and 1e-6 <= v <= 1)(value) and bool(value),
-    ),
-    "drawn_by, if any": TEXT,
-    "dead_time_effects, if any": OBJECT,
-    "temperature, if any": NUMBER,
-    "pixel_pitch, if any": POSITIVE,
-}
 JOB: Table = {"split": SPLIT, "digest": TEXT, "scene, if any": TEXT, "state, if any": TEXT, "record, if any": DIGEST}
 DATASET: Table = {"name": TEXT, "recipe": {"recipe, if any": OBJECT}, "jobs": OBJECT}
 RECORD: Table = {

@@ -56,4 +56,4 @@ for axis, (name, stream) in zip(axes, streams.items(), strict=True):
 # %%
 # The json of a stream stores the table, so the stream can be drawn again.
 
-print(streams["noisy"].meta["defects"])
+print(streams["noisy"].info.defects)

@@ -30,7 +30,7 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
-from qsim.streams.stream import Stream
+from qsim.streams.stream import Stream, is_stream
 
 _BLOCK_BYTES = 1 << 25
 _DARK_MAP = "_dark.npy"  # ends of file names
@@ -87,7 +87,7 @@ def stream_of(path: Path) -> Stream | None:
     if path.suffix not in (".npy", ".json"):
         return None
     side = path.with_suffix(".json")
-    if not side.is_file() or "ppp_factor" not in files.read_json(side):
+    if not side.is_file() or not is_stream(side):
         return None
     return Stream.open(side)
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from qsim import files, records
+from qsim import files
 from qsim.cli.command import Idle, command
 from qsim.cli.completion import sensors
 from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, note, output, running
 from qsim.cli.options import check_free
-from qsim.clip.source import Times
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
@@ -20,7 +19,7 @@ from qsim.kinds import Positive, Split, Text, Whole
 from qsim.restored_video import describes_restored
 from qsim.settings import setting, settings_of
 from qsim.streams.clip import Clip
-from qsim.streams.stream import Stream
+from qsim.streams.stream import Stream, is_stream
 
 PICTURES = ("mp4", "png", "nerfstudio")  # kinds that show light through a transfer curve
 _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs", ".dat": "spike", ".npz": "photons"}
@@ -105,7 +104,7 @@ class Convert:
 
 
 def _is_stream(path: Path) -> bool:
-    return path.suffix == ".json" and path.is_file() and "ppp_factor" in files.read_json(path)
+    return path.suffix == ".json" and path.is_file() and is_stream(path)
 
 
 # ---- What cannot act
@@ -268,13 +267,10 @@ def _restored(source: Path) -> dict[str, Any]:
 
 def _size(made: Clip | Stream) -> str:
     frames, height, width = made.shape
-    rate = made.frame_rate if isinstance(made, Clip) else float(made.meta["frame_rate"])
+    rate = made.info.frame_rate
     exposure = made.exposure
     said = f"{frames} frames of {height} x {width} pixels at {rate:g} per second, exposure {exposure * 1e6:.4g} us"
-    if isinstance(made, Clip):
-        times = made.info.times
-    else:
-        times = records.convert(made.meta["times"], Times, "times") if "times" in made.meta else None
+    times = made.info.times
     if times is None:
         return said
     return f"{said}, times {times.values[0]:.10g} to {times.values[-1]:.10g} {times.unit} ({times.source})"

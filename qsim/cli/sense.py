@@ -12,8 +12,9 @@ from qsim.cli.command import Idle, command
 from qsim.cli.console import MAKES_AGAIN, bar, note, output, running
 from qsim.kinds import Text
 from qsim.settings import setting, settings_of
-from qsim.streams import sensing as drawing
+from qsim.streams import storing
 from qsim.streams.sensing import Sensing
+from qsim.streams.stream_info import StreamInfo
 
 
 @dataclass(frozen=True)
@@ -78,11 +79,11 @@ def sense(asked: Sense, wanted: Annotated[tuple[Sensing, ...], {"sensor": "quive
                     progress(start + done, frames)
 
                 waiting = partial(note, f"{clip.path}: waiting for another process that senses this clip")
-                found, line = drawing.sense(clip, sensing, force=asked.force, progress=count, on_wait=waiting)
+                found, line = storing.sense(clip, sensing, force=asked.force, progress=count, on_wait=waiting)
                 before += len(clip)
                 facts = {"clip": str(clip.path), "stream": found.name, "file": str(found.path), "made": bool(drawn)}
                 facts["light"] = line
-                made.append(facts | _light(found.meta))
+                made.append(facts | _light(found.info))
     if len(wanted) > 1:
         note("streams of a clip with the same --seed share their random numbers: another --seed makes them independent")
     lines = [_line(m) for m in made]
@@ -97,9 +98,12 @@ def _line(made: dict[str, Any]) -> str:
     return f"{'wrote' if made['made'] else 'exists already:'} {made['file']}: {kind}; {made['light']}"
 
 
-def _light(meta: dict[str, Any]) -> dict[str, Any]:
-    keys = ("ppp", "ppp_factor", "mean_photons_before", "equivalent_lux_555nm", "bits", "shape", "code_model")
-    return {key: meta[key] for key in keys}
+def _light(info: StreamInfo) -> dict[str, Any]:
+    """Return what `--json` states of a stream that was drawn."""
+    assert info.light is not None
+    levels = {"ppp": info.light.ppp, "ppp_factor": info.light.factor, "mean_photons_before": info.light.before}
+    facts = {"equivalent_lux_555nm": info.light.lux, "bits": info.bits, "shape": list(info.shape)}
+    return levels | facts | {"code_model": info.code_model}
 
 
 def _replay(asked: Sense, clips: list[Any], sensing: Sensing) -> int:
@@ -116,7 +120,7 @@ def _replay(asked: Sense, clips: list[Any], sensing: Sensing) -> int:
     if len(known) > 1 and not sensing.name and not named and sensing.stream_name not in known:
         raise ValueError(f"{clip.path}: choose one of its streams with --name: {', '.join(known)}")
     stored = clip.stream(known[0] if len(known) == 1 and not sensing.name and not named else sensing.stream_name)
-    drawn, kept = drawing.replay(clip, stored, int(number))
+    drawn, kept = storing.replay(clip, stored, int(number))
     differ = int((drawn != kept).sum())
     found = {"clip": clip.name, "stream": stored.name, "frame": int(number), "pixels": drawn.size, "differ": differ}
     verdict = (

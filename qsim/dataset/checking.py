@@ -23,8 +23,8 @@ from qsim.dataset.job_record import JobInfo, read_record, record_path, verify_jo
 from qsim.files import Progress
 from qsim.restored_video import Restored, describes_restored
 from qsim.streams.clip import Clip
-from qsim.streams.simulation import stored
-from qsim.streams.stream import Stream
+from qsim.streams.storing import stored
+from qsim.streams.stream import Stream, is_stream
 
 PROMISED = 5e-6  # share of codes in which the compiled engine may differ from the reference
 _BLOCK_PIXELS = 1 << 20
@@ -47,7 +47,7 @@ def check(path: Path, progress: Progress | None = None) -> list[str]:
         return _checked(lambda: Clip.open(path), path / "clip.json", progress)
     description = path.with_suffix(".json")
     found = files.read_json(description)
-    if "ppp_factor" in found:
+    if "code_model" in found:
         return _checked(lambda: Stream.open(description), description, progress)
     if describes_restored(found):
         return _checked(lambda: Restored.open(description), description, progress)
@@ -150,7 +150,7 @@ def _streams(path: Path) -> list[tuple[Path, Path, Path | None]]:
             Clip.open(path)  # raises the error that names what is missing
         return _of_clip(path)
     described = path.with_suffix(".json")
-    if "ppp_factor" not in files.read_json(described):  # restored video
+    if not is_stream(described):  # restored video
         return []
     return [(described.absolute().parents[1], described, None)]
 

@@ -27,7 +27,8 @@ from qsim.process import peak_memory
 from qsim.rendering.budget import Budget
 from qsim.rendering.reuse.sharing import Sharing
 from qsim.streams.clip import Clip
-from qsim.streams.sensing import frames_needed, sense
+from qsim.streams.sensing import frames_needed
+from qsim.streams.storing import sense
 from qsim.tables import text_table
 
 START = 3.0  # s, start of a worker process with its renderer, once per Limits.jobs jobs; measured on two cores

@@ -27,7 +27,7 @@ from qsim.dataset.job_record import Failure, JobRecord, failure_path, record_pat
 from qsim.dataset.provenance import assets, origin, photographs
 from qsim.process import peak_memory
 from qsim.streams.clip import Clip
-from qsim.streams.sensing import sense
+from qsim.streams.storing import sense
 
 if TYPE_CHECKING:
     from qsim.rendering.budget import Budget

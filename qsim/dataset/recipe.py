@@ -63,7 +63,8 @@ from qsim.rendering.render_settings import RenderSettings
 from qsim.scene.animated.gltf_body import GLTF_SUFFIXES, animated_file, animations_in
 from qsim.scene.camera_path import PLAIN, read_camera_path
 from qsim.settings import settings_of
-from qsim.streams.sensing import Sensing, filters_of, prepare
+from qsim.streams.preparation import prepare
+from qsim.streams.sensing import Sensing, filters_of
 
 SPLITS = checks.SPLITS
 MAX_STEM = 180  # characters of a scene's name, which gets a seed, a speed and a temporary ending as a file's name

@@ -58,8 +58,8 @@ def write(clip: Clip, folder: Path, planes: int) -> dict[str, Any]:
         "left_out": frames - cubes * planes,
         "detections_at_white": DETECTIONS,
         "clipped": clipped / cubes,
-        "seeds": [band.meta.get("seed") for band in bands],
-        "sensors": [band.meta["sensor"] for band in bands],
+        "seeds": [band.info.seed for band in bands],
+        "sensors": [band.info.sensor for band in bands],
         "benchmark": (planes, height, width) == (PLANES, SIDE, SIDE),
     }
 
@@ -75,7 +75,7 @@ def bands_of(clip: Clip, planes: int) -> list[Stream]:
     bands = [clip.stream(name) for name in COLOURS]
     for band in bands:
         band.require_even("a cube of the challenge")
-        single = band.bits == 1 and (band.meta.get("planes_per_code") or 1) == 1
+        single = band.bits == 1 and band.info.planes_per_code == 1
         if not (single and band.sensor.sums_planes) or band.shape != bands[0].shape:
             kind = type(band.sensor).__name__
             raise ValueError(
@@ -87,7 +87,7 @@ def bands_of(clip: Clip, planes: int) -> list[Stream]:
         if filters is not None and filters.mask != MASKS[name]:
             found = ", ".join(filters.mask)
             raise ValueError(f"{band.path}: its filters are {found}, not {name}; sense it with --colour {name}")
-    seeds = [band.meta.get("seed") for band in bands]
+    seeds = [band.info.seed for band in bands]
     for n, seed in enumerate(seeds):
         if seed is not None and seed in seeds[:n]:
             raise ValueError(

@@ -17,7 +17,7 @@ from qsim.files import VERSION
 from qsim.formats import array_files, challenge, images, photon_times, raw_cameras, video
 from qsim.scene.camera_path import camera_path
 from qsim.streams.clip import Clip
-from qsim.streams.stream import Stream, orientation
+from qsim.streams.stream import Stream
 
 BLOCK = 16  # frames read at a time
 
@@ -100,7 +100,7 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
         about = f"linear light in {source.info.radiance_unit}"
     if isinstance(source, Clip):
         about += "; not written: codes, flow, depth (--to pairs writes codes, truth and flow)"
-    rate = source.frame_rate if isinstance(source, Clip) else float(source.meta["frame_rate"])
+    rate = source.info.frame_rate
     if wanted.kind == "challenge":
         return made, f"challenge, {challenge.line(meta)}"
     return made, f"{wanted.kind}, {frames} frames of {height} x {width} pixels at {rate:g} per second{shown}, {about}"
@@ -225,36 +225,13 @@ EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
 def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
     if isinstance(source, Clip):
         facts = {key: value for key, value in records.plain(source.info, complete=True).items() if value is not None}
+        kept = ("shape", "frame_rate", "exposure", "radiance_unit", "scene", "split", "seed", "bands", "origin")
+        found = {key: facts[key] for key in kept if key in facts}
     else:
-        facts = source.meta
-    keys = (
-        "shape",
-        "frame_rate",
-        "exposure",
-        "radiance_unit",
-        "scene",
-        "split",
-        "bits",
-        "code_model",
-        "sensor",
-        "seed",
-        "ppp",
-        "ppp_target",
-        "lux_target",
-        "ppp_factor",
-        "width",
-        "planes_per_code",
-        "rows",
-        "exposures",
-        "bands",
-        "colour",
-        "defects",
-        "origin",
-        "diffraction",
-    )
-    found = {key: facts[key] for key in keys if key in facts}
+        own = ("sha256", "software", "clip_key")  # of the stream's file
+        found = {key: value for key, value in records.plain(source.info).items() if key not in own}
     found |= {"format_version": 1, "bit_order": "msb", "software": {"qsim": VERSION}}
-    found["orientation"] = source.info.orientation if isinstance(source, Clip) else orientation(source.meta)
+    found["orientation"] = source.info.orientation
     if isinstance(source, Clip):
         written = {"exr": "linear", "zarr": "linear", "challenge": "srgb"}
         found["transfer"] = written.get(wanted.kind, wanted.transfer)

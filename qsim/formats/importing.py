@@ -18,10 +18,9 @@ from typing import Any, cast
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files, records
 from qsim.checks import file_path
 from qsim.clip import exr
-from qsim.clip.clip_info import RELATIVE, ClipInfo, Saturation
+from qsim.clip.clip_info import ClipInfo, Saturation
 from qsim.clip.manifest import check_outside
 from qsim.clip.source import Source
 from qsim.clip.writer import ClipWriter
@@ -37,7 +36,8 @@ from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 from qsim.streams.clip import Clip
-from qsim.streams.stream import Stream, write_packed
+from qsim.streams.stream import Stream, is_stream, write_packed
+from qsim.streams.stream_info import StreamInfo
 
 
 def read(path: Path | str, hints: Hints | None = None, *, compared: tuple[str, ...] = ()) -> Recording:
@@ -215,7 +215,7 @@ def to_stream(
     for file in (npy, description):
         if file.exists() and not force:
             raise FileExistsError(f"{file}: exists; name another, or use --force to replace it")
-        if file.exists() and (not description.is_file() or "ppp_factor" not in files.read_json(description)):
+        if file.exists() and (not description.is_file() or not is_stream(description)):
             raise FileExistsError(
                 f"{file}: is not a stream, which is all that --force replaces; move it away, or name another"
             )
@@ -236,27 +236,20 @@ def to_stream(
             if progress is not None:
                 progress(start + len(block), frames)
 
-    meta = {
-        "shape": [frames, height, width],
-        "orientation": recording.source.orientation or "unknown",  # upright only if a reader states it
-        "code_model": model,
-        "planes_per_code": 2**recording.bits - 1 if model == "binary_sum" else 1,
-        "frame_rate": capture.frame_rate,
-        "exposure": capture.seconds,
-        "sensor_name": capture.sensor,
-        "ppp_target": None,
-        "ppp_factor": None,
-        "radiance_unit": RELATIVE,
-        "transfer": "linear",
-        "seed": None,
-        "source": records.plain(recording.source),
-    } | _times_of(recording)
-    return write_packed(npy, packed(), sensor, meta | tables)
-
-
-def _times_of(recording: Recording) -> dict[str, Any]:
-    """Return the table `times` of a description, if the source states when each frame was taken."""
-    return {} if recording.times is None else {"times": records.plain(recording.times)}
+    info = StreamInfo.of(
+        sensor,
+        sensor_name=capture.sensor or "",
+        shape=(frames, height, width),
+        orientation=recording.source.orientation or "unknown",  # upright only if a reader states it
+        code_model=model,
+        planes_per_code=2**recording.bits - 1 if model == "binary_sum" else 1,
+        frame_rate=capture.frame_rate,
+        exposure=capture.seconds,
+        source=recording.source,
+        times=recording.times,
+        **tables,
+    )
+    return write_packed(npy, packed(), info)
 
 
 def _as_stated(path: Path, recording: Recording, capture: Import) -> Import:
@@ -300,7 +293,7 @@ def _tables(capture: Import, sensor: Sensor, height: int, width: int) -> tuple[S
         return sensor, {}
     defects = defect_table.from_toml(capture.sensor)
     filters = colour_filter.from_toml(capture.sensor)
-    found: dict[str, Any] = {} if filters is None else {"colour": filters.to_dict()}
+    found: dict[str, Any] = {} if filters is None else {"colour": filters}
     if defects is None:
         return sensor, found
     return PixelArray.of(defects, sensor, height, width).sensor, found | {"defects": defects.to_dict()}

@@ -49,7 +49,7 @@ class Window:
     def flow(self) -> Array:
         """Return the flow, float32 [T, 2, H, W]; NaN where hidden or unknown, for sums of frames and rolling rows."""
         found = np.full((self.frames, 2, *self.clip.shape[1:]), np.nan, np.float32)
-        single = (self.stream.meta.get("planes_per_code") or 1) == 1 and self.stream.rows is None
+        single = self.stream.info.planes_per_code == 1 and self.stream.rows is None
         if self.clip.has_truth and single:
             for n, t in enumerate(range(self.first, self.first + self.frames)):
                 if t + 1 < len(self.clip):
@@ -58,13 +58,13 @@ class Window:
 
     def facts(self) -> dict[str, Any]:
         """Return what the file states of this window beside its arrays."""
-        meta = self.stream.meta
-        ppp = meta.get("ppp")
-        sensor = json.dumps(meta["sensor"] | ({"defects": meta["defects"]} if "defects" in meta else {}))
+        info = self.stream.info
+        ppp = None if info.light is None else info.light.ppp
+        sensor = json.dumps(info.sensor | ({"defects": info.defects} if info.defects else {}))
         light = {"bits": self.stream.bits, "ppp": np.nan if ppp is None else float(ppp)}
-        rates = {"exposure": self.stream.exposure, "frame_rate": float(meta["frame_rate"])}
+        rates = {"exposure": self.stream.exposure, "frame_rate": info.frame_rate}
         names = {"clip": self.clip.name, "stream": self.stream.name, "sensor": sensor}
-        names |= {"code_model": str(meta.get("code_model", ""))}
+        names |= {"code_model": info.code_model}
         return {"first": self.first} | light | rates | names
 
 

@@ -31,7 +31,7 @@ from qsim.kinds import Positive, Whole
 from qsim.records import convert
 from qsim.sensor.defects.event_simulation import DETECTED, RELEASED
 from qsim.streams.rows import Rows, from_dict
-from qsim.streams.simulation import stored
+from qsim.streams.storing import stored
 from qsim.streams.stream import Stream
 
 FORMAT = "qsim-photons-1"
@@ -129,12 +129,13 @@ def write(stream: Stream, path: Path) -> int:
     first = np.concatenate([[0], np.cumsum([len(times) for times, _ in pixels])]).astype(np.int64)
     times = np.concatenate([times for times, _ in pixels])
     kind = np.concatenate([kind for _, kind in pixels])
-    rate = float(stream.meta["frame_rate"])
+    rate = stream.info.frame_rate
     found = PhotonTimes((frames, height, width), stream.exposure, rate, times, kind, first)
     if not np.array_equal(np.minimum(found.counts(), stream.sensor.levels - 1), stream.codes()):
         raise ValueError(f"{stream.path}: its codes are not the counts of its photons; sense it again with --force")
     meta = {"format": FORMAT, "shape": [frames, height, width], "exposure": stream.exposure, "frame_rate": rate}
-    text = files.to_json(meta | {key: stream.meta[key] for key in ("sensor", "rows") if key in stream.meta})
+    rows = {} if stream.rows is None else {"rows": stream.rows.to_dict()}
+    text = files.to_json(meta | {"sensor": stream.info.sensor} | rows)
     with files.replacing(path) as file:
         np.savez(file, times=times, kind=kind, first=first, meta=np.frombuffer(text, np.uint8))
     return len(times)

@@ -30,7 +30,7 @@ from qsim.report.panels import (
     truth_photons,
     truth_stack,
 )
-from qsim.sensor.defects import defect_table, fixed_pattern
+from qsim.sensor.defects import fixed_pattern
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
@@ -139,9 +139,9 @@ def in_bands(clip: Clip) -> str:
 
 def stream_line(stream: Stream) -> str:
     """Return sensor and light level of a stream as one line."""
-    meta = stream.meta
-    ppp = meta.get("ppp")
-    lux = meta.get("equivalent_lux_555nm")
+    level = stream.info.light
+    ppp = None if level is None else level.ppp
+    lux = None if level is None else level.lux
     light = "" if ppp is None else f": {ppp:.4g} photons per pixel (the clip's light × {stream.photons_factor:.4g})"
     light += "" if lux is None else f", equal to {lux:.4g} lx at 555 nm"
     efficiency = stream.sensor.efficiency
@@ -163,7 +163,7 @@ def timing_words(stream: Stream) -> str:
 def defects_words(stream: Stream) -> str:
     """Return "; defects: prnu 0.01, dark_map my_dark.npy", or "" without defects."""
     words = []
-    for name, value in stream.meta.get("defects", {}).items():
+    for name, value in stream.info.defects.items():
         text = f"{value:g}" if isinstance(value, float) else str(value)
         if isinstance(value, dict):
             parts = (f"{key} {v:g}" for key, v in value.items() if isinstance(v, int | float))
@@ -229,7 +229,7 @@ def code_histogram(clip: Clip, stream: Stream) -> Markup:
             missing = str(error)
         else:
             axes.plot(np.arange(levels), expected, "k_", markersize=14, label="expected")
-            mixed = " and its map of defects" if "defects" in stream.meta else ""
+            mixed = " and its map of defects" if stream.info.defects else ""
             words += f", and expected from the light by the exact distribution of the sensor{mixed}"
     if missing is not None:
         words += f"; no expectation is shown: {missing}"
@@ -239,20 +239,20 @@ def code_histogram(clip: Clip, stream: Stream) -> Markup:
 
 def unexpected(clip: Clip, stream: Stream) -> str | None:
     """Return why the codes of a stream have no exact expectation; None if they have one."""
-    own = stream.meta.get("defects", {})
+    own = stream.info.defects
     if 2**stream.bits > 64:
         return "more than 64 codes"
     if stream.rows is not None:
         return "every row sees its own part of two frames of the clip"
     if stream.shares is not None:
         return "its codes have different exposures"
-    if int(stream.meta.get("planes_per_code", 1)) > 1 or "planes_of" in stream.meta or len(stream) != len(clip):
+    if stream.info.planes_per_code > 1 or stream.info.planes_of or len(stream) != len(clip):
         return "a code sums planes of several frames of the clip"
-    if stream.meta["ppp_factor"] is None:
+    if stream.info.light is None:
         return "its light is unknown"
     if own.get("crosstalk") or own.get("afterpulse"):
         return "crosstalk and afterpulses make a code depend on its neighbours or on the frame before"
-    if stream.meta.get("drawn_by") == "events":
+    if stream.info.drawn_by == "events":
         return "dead time inside and between exposures was followed photon by photon"
     return None
 
@@ -268,7 +268,7 @@ def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64
     height, width = clip.shape[1:]
     share = max(1.0, len(chosen) / _SAMPLES)  # more frames, fewer pixels of each
     step = mosaic_step(max(1, int(np.sqrt(height * width * share / _PIXELS))), stream.colour_filter)
-    blurred = bool(stream.meta.get("diffraction", False))
+    blurred = stream.info.sensing.diffraction
     light = []
     for t in chosen:
         each = clip_photons(clip, int(t), stream.photons_factor, diffraction=blurred)
@@ -277,8 +277,8 @@ def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64
         light.append(each[::step, ::step].copy())  # not a view, which would keep the whole frame in memory
     sensor = stream.sensor
     maps = fixed_pattern.PERFECT
-    if "defects" in stream.meta:
-        found = defect_table.from_dict(stream.meta["defects"], f"{stream.name}: defects")
+    found = stream.defects
+    if found is not None:
         device = PixelArray.of(found, sensor, height, width, stream.origin)
         thinned = {name: None if m is None else m[::step, ::step] for name, m in vars(device.maps).items()}
         sensor = device.sensor

@@ -18,7 +18,6 @@ from qsim.clip.clamped_error import Errors, white_in
 from qsim.clip.clip_info import RELATIVE
 from qsim.colour import bright_end
 from qsim.report import html as page
-from qsim.sensor.defects import good_pixels
 from qsim.sensor.demosaicing import demosaic, determines_bands
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
@@ -88,7 +87,7 @@ def truth_stack(clip: Clip, frames: range) -> NDArray[np.float32]:
 
 def truth_photons(clip: Clip, stream: Stream, frames: range) -> Photons | None:
     """Return the sharp light of these frames [photons] at the level of a stream; None if a code has other frames."""
-    if stream.meta["ppp_factor"] is None or len(stream) != len(clip) or len(clip) < len(frames):
+    if stream.info.light is None or len(stream) != len(clip) or len(clip) < len(frames):
         return None
     return np.stack([clip_photons(clip, t, stream.photons_factor, sharp=True) for t in frames])
 
@@ -115,7 +114,7 @@ def stream_panels(stream: Stream, frames: range, truth: Photons | None = None) -
     averages = np.stack([codes[max(t - reach - first, 0) : t + reach + 1 - first].mean(axis=0) for t in frames])
     shown = codes[frames.start - first : frames.stop - first]
     names = f"codes, {stream.bits} bit ({stream.name})", f"mean of {colour.AVERAGE} frames"
-    sensor, left = good_pixels.of_stream(stream.sensor, stream.meta)
+    sensor, left = stream.good_pixels()
     filters = stream.colour_filter
     one, many = (_inverse(stream, sensor, samples) for samples in (1, min(colour.AVERAGE, len(stream))))
     if one is None or many is None:

@@ -260,7 +260,7 @@ def _source(info: RestoredInfo) -> tuple[Clip | None, Stream | None]:
         stream = Stream.open(path.with_suffix(".json"))
     except (IndexError, ValueError, OSError):
         return None, None
-    now = stream.meta.get("sha256")
+    now = stream.info.sha256
     shape = info.shape or stream.shape
     same = (info.source_sha256 or now) == now and (shape[0], *shape[-2:]) == tuple(stream.shape)
     return (clip, stream) if same else (None, None)

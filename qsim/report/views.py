@@ -71,7 +71,7 @@ def open_source(path: Path, *, bits: int | None = None, width: int | None = None
     _refuse(path, "not a clip", stream=stream)
     sidecar = path.with_suffix(".json")
     described = files.read_json(sidecar) if sidecar.is_file() else {}
-    if "ppp_factor" in described:
+    if "code_model" in described:
         _refuse(path, "a stream, which states its bits", bits=bits, width=width)
         return _stream_source(Stream.open(sidecar))
     if path.suffix != ".npy":
@@ -108,7 +108,7 @@ def _held_views(clip: Clip, stream: Stream) -> tuple[int, dict[str, View]]:
 
     Where rows have their own time, the middle of the readout counts.
     """
-    per = int(stream.meta.get("planes_per_code") or 1)
+    per = stream.info.planes_per_code
     if len(stream) * per > len(clip):  # of a bit-depth study: the planes are those of another clip
         per = 1
     views = _stream_source(stream).views
@@ -138,7 +138,7 @@ def _stream_source(stream: Stream) -> Source:
     if filters is not None and determines_bands(filters, own):  # else one filter over all pixels, shown in grey
         bands = partial(demosaic, filters=filters, efficiency=own)
     views = _code_views(stream.name, stream.bits, len(stream), read, bands)
-    return Source(stream.name, len(stream), float(stream.meta["frame_rate"]), views)
+    return Source(stream.name, len(stream), stream.info.frame_rate, views)
 
 
 def _array_source(path: Path, bits: int | None, width: int | None, video: RestoredInfo | None) -> Source:

@@ -18,7 +18,8 @@ from qsim.files import Progress
 from qsim.kinds import Text
 from qsim.sensor.sensor import Sensor
 from qsim.settings import taking
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from qsim.streams.stream import Stream
 
 

@@ -5,12 +5,10 @@ Sensing --prepare--> Draw     Draw --packed--> packed codes of a stream      --f
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from numpy import ndarray as Array
 
@@ -19,7 +17,7 @@ from qsim.files import Progress
 from qsim.keys import Key
 from qsim.optics.radiometry import Crop, LightLevel
 from qsim.sensor.colour_filter import ColourFilter
-from qsim.sensor.defects import defect_table, event_simulation
+from qsim.sensor.defects import event_simulation
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.event_simulation import Effects
 from qsim.sensor.defects.pixel_array import PixelArray
@@ -27,7 +25,6 @@ from qsim.sensor.sensor import Sensor
 from qsim.streams.drawing import DRAWERS, Drawer, Followed
 from qsim.streams.exposures import Exposures, Read, Timing
 from qsim.streams.photons import clip_photons
-from qsim.streams.stream import Stream
 
 Made = TypeVar("Made", bound=Drawer)
 _BLOCK_PIXELS = 1 << 22  # photons held in memory at a time while sensing: 32 MiB of float64
@@ -137,60 +134,3 @@ class Draw:
                 f"{clip.name}: its codes were not drawn photon by photon; sense a CountingSPAD with --follow"
             )
         return self._drawer(clip, Followed).trace(frames)
-
-
-def stored(stream: Stream) -> Draw:
-    """Return the draw of a stored stream, from its json; `ValueError` for an imported stream."""
-    meta = stream.meta
-    for name in ("seed", "clip_key", "ppp", "mean_photons_before", "ppp_factor", "drawn_by"):
-        if meta.get(name) is None:
-            raise ValueError(f"{stream.path}: its description holds no {name}: it was not drawn from a clip by qsim")
-    timing = stream.timing
-    law = meta["drawn_by"]
-    if law not in DRAWERS:
-        raise ValueError(f"{stream.path}: drawn by {law!r}, which is none of {', '.join(DRAWERS)}; sense it again")
-    level = LightLevel(
-        stream.photons_factor, meta["ppp"] / timing.frames, meta["mean_photons_before"] / timing.frames, None
-    )
-    key = Key(seed=meta["seed"], clip=meta["clip_key"])
-    where = f"{stream.path.with_suffix('.json')}: defects"
-    found = defect_table.from_dict(meta["defects"], where) if "defects" in meta else None
-    followed = event_simulation.Effects(**meta["dead_time_effects"]) if law == "events" else None
-    diffraction = bool(meta.get("diffraction", False))
-    draw = Draw(stream.sensor, level, key, timing, diffraction, found, followed, colour=stream.colour_filter)
-    return dataclasses.replace(draw, origin=stream.origin)
-
-
-OPTIONAL = (
-    "defects",
-    "rows",
-    "colour",
-    "exposures",
-    "origin",
-    "temperature",
-    "pixel_pitch",
-)  # keys that are left out where off
-
-
-def same_settings(old: dict[str, Any], new: dict[str, Any]) -> bool:
-    """Return whether two descriptions of streams have the same settings; folders of files do not count, nor do the
-    stated effects of dead time: `drawn_by` tells what they led to.
-    """
-    old = _without_folders(old)
-    new = _without_folders(new)
-    new.pop("dead_time_effects", None)
-    same = all(old.get(key) == value for key, value in new.items())
-    return same and all(old.get(key) == new.get(key) for key in OPTIONAL)
-
-
-def _without_folders(meta: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of a description: a sensor file has its name alone, measured maps have their checksums."""
-    meta = dict(meta)
-    name = meta.get("sensor_name")
-    table = meta.get("defects")
-    if isinstance(name, str) and name.endswith(".toml"):
-        meta = meta | {"sensor_name": Path(name).name}
-    if isinstance(table, dict):
-        maps = {key: value["sha256"] for key, value in table.items() if isinstance(value, dict) and "sha256" in value}
-        meta = meta | {"defects": table | maps}
-    return meta

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import colour, files, locks, structure
+from qsim import colour, descriptions, files, locks
 from qsim.checks import file_path
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
@@ -27,15 +27,17 @@ from qsim.clip.lazy_array import LazyArray
 from qsim.files import VERSION, Progress
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.sensor import packing
+from qsim.sensor.defects import defect_table, good_pixels
+from qsim.sensor.defects.defect_table import Defects
 from qsim.streams.exposures import Timing
 from qsim.streams.photons import clip_photons
-from qsim.streams.rows import Rows, from_dict
+from qsim.streams.rows import Rows
+from qsim.streams.stream_info import StreamInfo
 
 if TYPE_CHECKING:
     from qsim.sensor.colour_filter import ColourFilter
     from qsim.sensor.sensor import Sensor
 
-FORMAT_VERSION = 1
 _DAMAGED = "the file is damaged: run `qsim sense --force`"
 
 
@@ -44,7 +46,7 @@ class Stream:
     """Codes of one clip seen by one sensor at one light level."""
 
     path: Path  # streams/NAME.npy
-    meta: dict[str, Any]  # streams/NAME.json
+    info: StreamInfo  # streams/NAME.json
     keeps: object = field(default=None, repr=False)  # a temporary folder: it lasts as long as a reference to it
 
     @staticmethod
@@ -52,32 +54,24 @@ class Stream:
         """Open a stream; `FileNotFoundError` if it does not exist, `ValueError` if its description is damaged."""
         if not (json_path := file_path(json_path)).is_file():
             raise FileNotFoundError(f"{json_path}: no such stream")
-        meta = files.read_json(json_path)
-        files.check_version(json_path, meta.get("format_version"), FORMAT_VERSION)
-        structure.description(json_path, meta, structure.STREAM, _DAMAGED)
-        bits = meta["sensor"].get("bits", meta["bits"])
-        width = meta["shape"][2]
-        if (bits, width) != (meta["bits"], meta["width"]):
-            raise ValueError(f"{json_path}: bits or width contradict the sensor or the shape; {_DAMAGED}")
-        files.check_own(json_path, meta, _DAMAGED)
-        return Stream(json_path.with_suffix(".npy") if json_path.suffix == ".json" else json_path, meta)
+        info = descriptions.read(json_path, StreamInfo, _DAMAGED)
+        return Stream(json_path.with_suffix(".npy") if json_path.suffix == ".json" else json_path, info)
 
     def __len__(self) -> int:
-        return int(self.meta["shape"][0])
+        return self.info.shape[0]
 
     @property
     def times(self) -> Array | None:
         """When each code was taken, as the source of an imported stream states it, float64 [T]; else None."""
-        found = self.meta.get("times")
-        return None if found is None else np.array(found["values"], np.float64)
+        times = self.info.times
+        return None if times is None else np.array(times.values, np.float64)
 
     def __repr__(self) -> str:
         frames, height, width = self.shape
-        ppp = self.meta.get("ppp")
-        light = "" if ppp is None else f", {ppp:.4g} photons/pixel"
+        light = "" if self.info.light is None else f", {self.info.light.ppp:.4g} photons/pixel"
         return (
             f"<Stream {self.name}: {frames} codes of {self.bits} bit, {height} x {width} px, at "
-            f"{float(self.meta['frame_rate']):g}/s, exposure {self.exposure * 1e6:.4g} us{light}>"
+            f"{self.info.frame_rate:g}/s, exposure {self.exposure * 1e6:.4g} us{light}>"
         )
 
     def _repr_html_(self) -> str:
@@ -109,13 +103,23 @@ class Stream:
         """
         return LazyArray(self.shape, np.dtype(packing.code_dtype(self.bits)), self._read)
 
-    @cached_property
+    @property
     def colour_filter(self) -> ColourFilter | None:
         """The colour filter array over the pixels, from the first one on; None: all pixels see one band."""
-        from qsim.sensor import colour_filter
+        return self.info.colour
 
-        where = f"{self.path.with_suffix('.json')}: colour"
-        return colour_filter.from_dict(self.meta["colour"], where) if "colour" in self.meta else None
+    @property
+    def defects(self) -> Defects | None:
+        """The defects of the pixels; None without any. `ValueError` or `OSError` if a measured map has changed."""
+        where = f"{self.path.with_suffix('.json')}: defects"
+        return defect_table.from_dict(self.info.defects, where) if self.info.defects else None
+
+    def good_pixels(self) -> tuple[Sensor, str]:
+        """Return the sensor of the pixels without defects, and which defects its response leaves out, as text."""
+        light = None if self.info.light is None else self.info.light.ppp
+        return good_pixels.of_table(
+            self.sensor, self.info.defects, light, self.exposure, self.info.shape[1:], self.info.origin
+        )
 
     @cached_property
     def clip(self) -> ClipFolder:
@@ -153,16 +157,17 @@ class Stream:
         exposures = self.timing.over(self.clip)
         return ~np.stack([exposures.middle(self.clip.saturated, t) for t in range(len(self))])
 
-    @property
+    @cached_property
     def timing(self) -> Timing:
         """When codes collect light: clip frames, rows and schedule."""
-        frames = int(self.meta.get("planes_per_code") or 1)
-        return Timing(frames, frames > 1 and self.sensor.sums_planes, self.rows, self.shares)
+        frames = self.info.planes_per_code
+        sensing = self.info.sensing
+        return Timing(frames, frames > 1 and self.sensor.sums_planes, sensing.rows, sensing.exposures)
 
-    @cached_property
+    @property
     def rows(self) -> Rows | None:
         """The delay of rows or columns; None: all are read at once."""
-        return from_dict(self.meta["rows"], f"{self.path.with_suffix('.json')}: rows") if "rows" in self.meta else None
+        return self.timing.rows
 
     def require_even(self, what: str) -> None:
         """Raise `ValueError` if rows have their own time or codes different exposures, which `what` does not know."""
@@ -181,29 +186,27 @@ class Stream:
 
     @property
     def bits(self) -> int:
-        return int(self.meta["bits"])
+        return self.info.bits
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """(T, H, W) of the codes, before packing."""
-        frames, height, width = self.meta["shape"]
-        return frames, height, width
+        return self.info.shape
 
     @property
     def origin(self) -> tuple[int, int]:
         """(y, x) of the first pixel in the full frame."""
-        y, x = self.meta.get("origin") or (0, 0)
-        return y, x
+        return self.info.origin
 
     @property
     def exposure(self) -> float:
         """Seconds of light in one code: in all its planes if it sums some, in a full one under a schedule."""
-        return float(self.meta["exposure"])
+        return self.info.exposure
 
     @property
     def shares(self) -> tuple[float, ...] | None:
         """The exposures of codes in turn, over a full one; None: all are full."""
-        return tuple(self.meta["exposures"]) if "exposures" in self.meta else None
+        return self.timing.shares
 
     @property
     def exposures(self) -> Array:
@@ -213,15 +216,15 @@ class Stream:
     @property
     def photons_factor(self) -> float:
         """Photons at the sensor over the clip's expected photons; `ValueError` for an imported stream."""
-        if self.meta["ppp_factor"] is None:
+        if self.info.light is None:
             raise ValueError(f"{self.path}: was imported, so its light is not known")
-        return float(self.meta["ppp_factor"])
+        return self.info.light.factor
 
     @cached_property
     def sensor(self) -> Sensor:
         from qsim.sensor import devices
 
-        return devices.from_dict(self.meta["sensor"], where=f"{self.path.with_suffix('.json')}: sensor")
+        return devices.from_dict(self.info.sensor, where=f"{self.path.with_suffix('.json')}: sensor")
 
     @cached_property
     def packed(self) -> Array:
@@ -245,7 +248,7 @@ class Stream:
             now = files.read_json(described)
         except FileNotFoundError:
             raise ValueError(problem) from None
-        if now.get("sha256", now) != self.meta.get("sha256", self.meta):
+        if now.get("sha256") != self.info.sha256:
             raise ValueError(problem)
         return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
@@ -279,7 +282,7 @@ class Stream:
 
     def verify(self, progress: Progress | None = None) -> list[str]:
         """Return one message per file whose checksum differs; empty if the stream is intact."""
-        problems = files.differs(self.path, self.meta.get("sha256"))
+        problems = files.differs(self.path, self.info.sha256)
         try:
             if problems:
                 self._written()
@@ -288,11 +291,9 @@ class Stream:
         return problems
 
 
-def orientation(meta: dict[str, Any]) -> str:
-    """Return the orientation of a clip or stream: that of its source file if it was imported, else upright."""
-    origin = meta.get("source")
-    imported = origin.get("orientation", "upright") if isinstance(origin, dict) else "upright"
-    return str(meta.get("orientation", imported))
+def is_stream(json_path: Path) -> bool:
+    """Return whether a description is that of a stream; errors as of `files.read_json`."""
+    return "code_model" in files.read_json(json_path)
 
 
 @contextlib.contextmanager
@@ -307,13 +308,13 @@ def writing(folder: Path, on_wait: Callable[[], None] | None = None) -> Iterator
         lock.delete()
 
 
-def write_packed(path: Path, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
+def write_packed(path: Path, blocks: Iterable[Array], info: StreamInfo) -> Stream:
     """Store packed codes (uint8 [t, H, ceil(W bits / 8)], in order) as `path`, NAME.npy; the json comes last.
 
-    `meta` must hold shape (T, H, W), ppp_factor, exposure and frame_rate. `ValueError` if there are not T frames.
+    `ValueError` if there are not as many frames as `info` states.
     """
-    frames, height, width = meta["shape"]
-    row = packing.packed_width(width, sensor.bits)
+    frames, height, width = info.shape
+    row = packing.packed_width(width, info.bits)
     json_path = path.with_suffix(".json")
     done = 0
     digest = hashlib.sha256()
@@ -330,19 +331,8 @@ def write_packed(path: Path, blocks: Iterable[Array], sensor: Sensor, meta: dict
             done += len(block)
         if done != frames:
             raise ValueError(f"{path}: got {done} frames, expected {frames}")
-        full = {
-            "format_version": FORMAT_VERSION,
-            "bits": sensor.bits,
-            "width": width,
-            "bit_order": "msb",
-            "orientation": "upright",
-            "code_model": sensor.code_model,
-            "sensor": sensor.to_dict(),
-            "planes_per_code": 1,
-            "sha256": digest.hexdigest(),
-            "software": {"qsim": VERSION},
-        } | meta
-        described.write(files.to_json(files.sealed(full)))
+        complete = replace(info, sha256=digest.hexdigest(), software={"qsim": VERSION})
+        described.write(files.to_json(descriptions.values_of(complete)))
     return Stream.open(json_path)
 
 

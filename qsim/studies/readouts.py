@@ -20,7 +20,6 @@ from numpy import ndarray as Array
 from qsim.clip.clamped_error import rms
 from qsim.colour import psnr
 from qsim.optics.radiometry import WHITE_PER_MEAN
-from qsim.sensor.defects import good_pixels
 from qsim.sensor.estimation import Response
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
@@ -90,7 +89,7 @@ def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) ->
     for stream in streams:
         per_code = _frames_per_code(stream)
         codes = max(1, round(window / per_code))
-        sensor, left = good_pixels.of_stream(stream.sensor, stream.meta)
+        sensor, left = stream.good_pixels()
         remarks += [f"{stream.name}: {left}"] if left else []
         response = sensor.response(stream.exposure, _POINTS)
         firsts = [_first_code(stream, t, codes) for t in centres]
@@ -101,7 +100,7 @@ def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) ->
 
 
 def _frames_per_code(stream: Stream) -> int:
-    return int(stream.meta.get("planes_per_code") or 1)
+    return stream.info.planes_per_code
 
 
 def _light(clip: Clip, first: int, window: int) -> Array:
@@ -123,8 +122,8 @@ def _estimate(stream: Stream, response: Response, first: int, codes: int) -> Arr
 
 def _row(stream: Stream, codes: int, seconds: float, score: float) -> ReadoutRow:
     height, width = stream.shape[1:]
-    rate = stream.bits * height * width * float(stream.meta["frame_rate"]) / 8e6
-    ppp = stream.meta.get("ppp")
+    rate = stream.bits * height * width * stream.info.frame_rate / 8e6
+    ppp = None if stream.info.light is None else stream.info.light.ppp
     model = type(stream.sensor).__name__
     light = None if ppp is None else float(ppp) * codes
     return ReadoutRow(stream.name, model, stream.bits, codes, seconds, light, score, rate)

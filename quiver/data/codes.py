@@ -29,7 +29,8 @@ from qsim.sensor.demosaicing import demosaic, determines_bands
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
-from qsim.streams.sensing import describe, followed
+from qsim.streams.preparation import followed
+from qsim.streams.storing import describe
 from qsim.streams.stream import Stream
 from quiver.data import defects
 from quiver.data.code_table import draw_codes
@@ -249,7 +250,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
         frame_rate=clip.frame_rate,
         read=read,
         source=f"{clip.path} seen by {light.sensor} ({light.label}), seed {seed}",
-        digest=lambda: sha256(to_json({"clip_info": records.plain(clip.info)} | describe(clip, sensing, draw))),
+        digest=lambda: sha256(to_json([records.plain(clip.info), records.plain(describe(clip, sensing, draw))])),
         sensor_name=light.sensor,
         ppp=draw.level.ppp,
         colour=draw.colour,
@@ -260,23 +261,23 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
 
 def stream_codes(stream: Stream) -> Codes:
     """Return the codes of a stored stream; its dead and hot pixels, where it states them, are filled."""
-    meta = stream.meta
+    info = stream.info
     bad, sensor = defects.of_stream(stream)
     codes = Codes(
         stream.name,
         stream.shape,
         sensor,
         stream.exposure,
-        float(meta["frame_rate"]),
+        info.frame_rate,
         stream.codes,
         str(stream.path),
         lambda: array_digest(stream.packed),
-        str(meta.get("sensor_name") or ""),
-        meta.get("ppp"),
+        info.sensor_name,
+        None if info.light is None else info.light.ppp,
         stream.shares,
         colour=stream.colour_filter,
-        source_sha256=meta.get("sha256"),
-        not_inverted=_not_inverted(meta.get("defects") or {}),
+        source_sha256=info.sha256,
+        not_inverted=_not_inverted(info.defects),
     )
     return filled(codes, bad)
 
@@ -287,8 +288,8 @@ def codes_of(stream: Stream) -> Codes:
     An imported stream states no light: pixels are hot beside the light that its codes tell.
     """
     codes = stream_codes(stream)
-    table = stream.meta.get("defects")
-    if table is None or stream.meta.get("ppp") is not None:
+    table = stream.info.defects
+    if not table or stream.info.light is not None:
         return codes
     try:
         return repaired(codes, defects.read_defects(table))

@@ -87,14 +87,14 @@ def of_stream(stream: Stream) -> tuple[Array | None, Sensor]:
 
     A warning where a map is missing.
     """
-    table = stream.meta.get("defects")
-    ppp = stream.meta.get("ppp")
-    if table is None or ppp is None:
+    table = stream.info.defects
+    light = stream.info.light
+    if not table or light is None:
         return None, stream.sensor
     _, height, width = stream.shape
     try:
         found = read_defects(table)
-        bad = defective(found, stream.sensor, stream.exposure, float(ppp), (height, width), stream.origin)
+        bad = defective(found, stream.sensor, stream.exposure, light.ppp, (height, width), stream.origin)
         return bad, behind(bad, found, stream.sensor, (height, width), stream.origin)
     except (OSError, ValueError) as error:
         warnings.warn(f"{stream.path}: its hot and dead pixels are not filled: {files.wording(error)}", stacklevel=2)

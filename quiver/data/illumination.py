@@ -25,7 +25,8 @@ from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.settings import given
 from qsim.streams.clip import Clip
-from qsim.streams.sensing import Sensing, assemble, prepare
+from qsim.streams.preparation import assemble, prepare
+from qsim.streams.sensing import Sensing
 from qsim.streams.simulation import Draw
 from qsim.streams.stream import Stream
 
@@ -69,20 +70,19 @@ class Illumination:
     def of_stream(cls, stream: Stream) -> Illumination:
         """Return the light and the noise of a stored stream. `ValueError` if training windows cannot have it."""
         refuse_others(unlike_windows(stream), str(stream.path.with_suffix(".json")))
-        meta = stream.meta
-        name = str(meta.get("sensor_name") or stream.sensor.to_dict()["model"])
-        named = "sensor_name" in meta and not name.endswith(".toml")
-        # A stream of another program states the light alone.
-        ppp = meta["ppp_target"] if "ppp_target" in meta else meta.get("ppp")
-        lux = meta.get("lux_target")
-        if lux is not None and "pixel_pitch" in meta:  # of a clip without a camera: these lux are so many photons
-            ppp = meta["ppp"]
-            lux = None
-        table = meta.get("defects")
+        info = stream.info
+        named = info.sensor_name != "" and not info.sensor_name.endswith(".toml")
+        settings = {name: value for name, value in info.settings.items() if name in HONOURED}
+        settings.pop("temperature", None)  # the record has its dark rate
+        pitched = settings.pop("pixel_pitch", None) is not None
+        # Of a stream of another program light alone is known, and lux of a clip without a camera are so many photons.
+        if info.light is not None and (info.clip_key is None or pitched):
+            settings.pop("lux", None)
+            settings["ppp"] = info.light.ppp
         return cls(
-            Sensing(name, bits=stream.bits, ppp=ppp, lux=lux, diffraction=bool(meta.get("diffraction", False))),
-            None if named else as_text(stream.sensor.to_dict()),
-            None if table is None else as_text(table),
+            Sensing(info.sensor_name or str(info.sensor["model"]), bits=stream.bits, **settings),
+            None if named else as_text(info.sensor),
+            as_text(info.defects) if info.defects else None,
         )
 
     @classmethod
@@ -217,7 +217,7 @@ def _with_own_spread(file: str, found: Defects | None) -> dict[str, Any]:
 def unlike_windows(stream: Stream) -> list[str]:
     """Return the settings of a stored stream that training windows cannot have."""
     unlike = []
-    planes = stream.meta.get("planes_per_code") or 1
+    planes = stream.info.planes_per_code
     if planes != 1:
         unlike.append(f"codes of {planes} clip frames")
     if stream.rows is not None:

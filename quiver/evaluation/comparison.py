@@ -114,7 +114,7 @@ def score_video(video: Array, stream: Stream, *, peak: float | None = None) -> m
     if np.shape(video) != expected:
         raise ValueError(f"video has shape {list(np.shape(video))}, stream {list(expected)}; they must be equal")
     target = stream.truth()
-    white = peak_of(float(stream.meta.get("ppp") or target.mean()), peak)
+    white = peak_of(target.mean() if stream.info.light is None else stream.info.light.ppp, peak)
     return metrics.score(np.asarray(video) / np.float32(white), target / white, valid=stream.known())
 
 
@@ -282,7 +282,9 @@ def in_memory(codes: Codes) -> Codes:
 def content_of(comparison: Comparison, clips: Sequence[Clip]) -> dict[str, Any]:
     """Return the SHA-256 of the scored content: the descriptions of clips and stored stream, and the sensor files."""
     name = comparison.stream
-    described = [[records.plain(clip.info), None if name is None else clip.stream(name).meta] for clip in clips]
+    described = [
+        [records.plain(clip.info), None if name is None else records.plain(clip.stream(name).info)] for clip in clips
+    ]
     found = {"content_sha256": hashlib.sha256(json.dumps(described, sort_keys=True, default=str).encode()).hexdigest()}
     files = file_digests(comparison.lights)
     return found | ({"sensors_sha256": files} if files else {})

@@ -24,7 +24,8 @@ from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints
 from qsim.report import report, views
 from qsim.streams.clip import Clip
-from qsim.streams.sensing import Sensing, replay, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import replay, sense
 from qsim.streams.stream import Stream
 from quiver.data import codes as data
 from quiver.restoration.restored_file import restore_to_file

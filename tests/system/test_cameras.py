@@ -16,8 +16,8 @@ from qsim.sensor import QIS, BinarySPAD, CountingSPAD, Sensor, SpikeCamera
 from qsim.sensor.defects.defect_table import from_dict
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
-from qsim.streams.sensing import Sensing, replay, sense
-from qsim.streams.simulation import stored
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import replay, sense, stored
 from qsim.streams.stream import Stream
 
 RATE = 2000.0
@@ -93,7 +93,7 @@ def departure(clip: Clip, stream: Stream, how: dict[str, Any]) -> float:
     change, by exposure.
     """
     sensor = stream.sensor
-    planes = stream.meta["planes_per_code"]
+    planes = stream.info.planes_per_code
     diffraction = how["diffraction"]
     light = np.stack([clip_photons(clip, t, stream.photons_factor, diffraction=diffraction) for t in range(len(clip))])
     height, width = clip.shape[1:]

@@ -19,7 +19,8 @@ from qsim.dataset.generation import Options, Summary, generate
 from qsim.dataset.job_runner import RenderJob
 from qsim.formats import exporting, importing
 from qsim.formats.exporting import Export
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 
 
 @pytest.fixture

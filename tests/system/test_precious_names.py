@@ -17,7 +17,8 @@ from qsim import files
 from qsim.cli import demo
 from qsim.cli import main as qsim
 from qsim.scratch import is_scratch
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.cli import main as quiver
 
 ENDINGS = (".part", ".part.json", ".lock", ".json", ".tmp-2", ".removed-20260102", ".tmp", ".new.safetensors", ".npy")

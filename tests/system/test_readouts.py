@@ -50,7 +50,7 @@ def test_from_the_recipe_to_a_comparison(tmp_path, capsys):
     assert (len(spike), len(conventional)) == (24, 2)
     assert conventional.exposure == pytest.approx(12 * spike.exposure)
     assert conventional.photons_factor == pytest.approx(spike.photons_factor)
-    assert conventional.meta["sensor"]["gain"] == pytest.approx(4095 / 10_000)
+    assert conventional.sensor.gain == pytest.approx(4095 / 10_000)
     back = tmp_path / "back"
     words = ["convert", str(tmp_path / "spike.dat"), str(back), "--frame-rate", "20000"]
     assert main([*words, "--sensor", str(tmp_path / "sensors" / "spike.toml")]) == 0

@@ -19,7 +19,8 @@ from qsim.dataset.dataset import Dataset
 from qsim.formats import exporting
 from qsim.formats.exporting import Export
 from qsim.streams.clip import Clip
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 
 QUICK = ["../../../victim", "/etc/victim", {}]
 SLOW = ["..", ".", "", "a/b", "a\nb", "-x", "a\0b", "x" * 5000, "ü", "a b", "~", 7, None, []]

@@ -66,22 +66,27 @@ def behind(
     return sensor.with_dark_rate(array.sensor.dark_rate * float(array.maps.dark[good].mean()))
 
 
-def of_stream(sensor: Sensor, meta: Mapping[str, Any]) -> tuple[Sensor, str]:
-    """Return the sensor of a stream's good pixels from its description, and which defects its response leaves out.
+def of_table(
+    sensor: Sensor,
+    table: Mapping[str, Any],
+    light: float | None,
+    exposure: float,
+    shape: tuple[int, int],
+    origin: tuple[int, int] = (0, 0),
+) -> tuple[Sensor, str]:
+    """Return the sensor of the good pixels behind a table [defects], and which defects its response leaves out.
 
-    The text is empty without defects. The sensor stays as it is where the light is unknown or a map is missing.
+    The text is empty without defects. The sensor stays as it is where the mean `light` [photons] of an `exposure` [s]
+    is unknown (None) or a map is missing. `shape` is that of the frames [H, W], `origin` (y, x) their place.
     """
-    table = meta.get("defects") or {}
-    ppp = meta.get("ppp")
     left = [_WORDS.get(key, key) for key in table if key not in _NO_EFFECT]
     if not left:
         return sensor, ""
     try:
-        found, (_, height, width) = from_dict(table), meta["shape"]
-        y, x = meta.get("origin") or (0, 0)
-        if ppp is not None:
-            bad = defective(found, sensor, float(meta["exposure"]), float(ppp), (height, width), (y, x))
-            sensor = behind(bad, found, sensor, (height, width), (y, x))
+        found = from_dict(table)
+        if light is not None:
+            bad = defective(found, sensor, exposure, light, shape, origin)
+            sensor = behind(bad, found, sensor, shape, origin)
     except (OSError, ValueError) as error:  # a measured map is missing or has changed
         return sensor, f"no defect is inverted: {files.wording(error)}"
     return sensor, f"not inverted: {', '.join(left)}"

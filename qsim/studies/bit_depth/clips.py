@@ -17,8 +17,9 @@ from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
 from qsim.streams.exposures import Timing
 from qsim.streams.photons import light_level
-from qsim.streams.sensing import Sensing, describe, sense, write_stream
+from qsim.streams.sensing import Sensing
 from qsim.streams.simulation import Draw
+from qsim.streams.storing import describe, sense, write_stream
 from qsim.studies.bit_depth.clip_study import check_clip
 from qsim.studies.bit_depth.readout import StudySettings, at_depth, plane_sensor, readouts
 
@@ -175,10 +176,10 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings, *, force: b
         # A code is one frame of `grouped`: its exposure is m times longer, which relative light does not know.
         more, before = (m, 1) if clip.camera is None else (1, m)
         of_code = replace(level, factor=more * level.factor, ppp=m * level.ppp, mean_before=before * level.mean_before)
-        meta = describe(grouped, replace(read, sensor=draw.sensor), replace(draw, level=of_code, timing=Timing()))
-        meta |= {"planes_of": str(clip.path), "drawn_by": draw.law, "seed": None}  # `grouped` cannot draw it again
+        info = describe(grouped, replace(read, sensor=draw.sensor), replace(draw, level=of_code, timing=Timing()))
+        info = replace(info, planes_of=str(clip.path), drawn_by=draw.law, clip_key=None)  # `grouped` cannot draw it
         frames = (draw.frames(clip, t, t + 1) for t in range(len(grouped)))
-        write_stream(grouped, "planes", frames, draw.sensor, meta)
+        write_stream(grouped, "planes", frames, info)
         made.append(path)
     return made
 

@@ -314,7 +314,7 @@ def test_streams_that_force_replaces_are_not_resumed_without_it(tmp_path, monkey
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("qsim.streams.sensing.sense", interrupt)
+    monkeypatch.setattr("qsim.streams.storing.sense", interrupt)
     resumes = "the same command resumes with the missing streams"
     for words, then in (([], resumes), (["--force"], console.MAKES_AGAIN)):
         assert main(["sense", str(clip.path), "--ppp", "1", *words]) == 130

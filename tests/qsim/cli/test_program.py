@@ -138,7 +138,7 @@ def test_sense_prints_one_line_of_light(made: Path, capsys: pytest.CaptureFixtur
     assert "exists already: " in run(capsys, "sense", clip, "--bits", 2, "--ppp", 3.25)[1]
     stream = Clip.open(clip).stream("quiver-physical_2bit_3.25ppp")
     assert stream.codes().max() <= 3
-    assert stream.meta["ppp_target"] == 3.25
+    assert stream.info.sensing.ppp == 3.25
 
 
 def test_sense_again_with_other_light_over_a_data_set(made: Path, capsys: pytest.CaptureFixture[str]):
@@ -232,8 +232,8 @@ def test_a_sum_of_planes_groups_clip_frames(tmp_path: Path, capsys: pytest.Captu
     assert run(capsys, *arguments)[0] == 0
     stream = Clip.open(tmp_path / "fast").stream("sum")
     assert len(stream) == 2
-    assert stream.meta["planes_per_code"] == 3
-    assert (stream.meta["frame_rate"], stream.exposure) == (2000.0, pytest.approx(3e-4))
+    assert stream.info.planes_per_code == 3
+    assert (stream.info.frame_rate, stream.exposure) == (2000.0, pytest.approx(3e-4))
     codes = stream.codes()
     assert codes[0].mean() > 2.5, "bright planes"
     assert codes[1].mean() < 0.5, "dark planes"

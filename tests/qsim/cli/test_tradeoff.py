@@ -8,7 +8,7 @@ from waves import SIZE, wave_clip
 
 from qsim.cli.program import main
 from qsim.streams.clip import Clip
-from qsim.streams.sensing import replay
+from qsim.streams.storing import replay
 from qsim.studies.bit_depth import clip_study
 
 
@@ -58,7 +58,7 @@ def test_streams_are_replaced_with_force_and_refused_before_the_study_without(cl
     ]
     for extra in ([], ["--force", "--seed", "1"]):
         assert main([*words, *extra]) == 0
-    assert Clip.open(out / "streams" / "wave_2bit").stream("multibit").meta["seed"] == 1
+    assert Clip.open(out / "streams" / "wave_2bit").stream("multibit").info.seed == 1
     (out / "tradeoff.json").unlink()
     (out / "tradeoff.png").unlink()
     monkeypatch.setattr(clip_study, "study", lambda *_, **__: pytest.fail("was studied first"))

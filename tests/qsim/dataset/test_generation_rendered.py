@@ -48,4 +48,4 @@ def test_a_killed_generation_resumes_to_the_same_bytes(tmp_path: Path):
         assert [asset for asset in clip.info.assets if asset.startswith("mesh ")]
         for name in clip.streams:
             stream = clip.stream(name)
-            assert stream.meta["ppp_target"] * 0.5 < stream.codes().mean() / stream.meta["sensor"]["gain"] / 0.8 * 2
+            assert stream.info.sensing.ppp * 0.5 < stream.codes().mean() / stream.sensor.gain / 0.8 * 2

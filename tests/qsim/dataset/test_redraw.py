@@ -1,5 +1,6 @@
 """`qsim check --redraw`: correct streams of every kind pass; wrong codes are found even if all checksums fit."""
 
+import dataclasses
 import json
 import shutil
 from dataclasses import replace
@@ -19,8 +20,11 @@ from qsim.dataset.recipe import Recipe
 from qsim.rendering.render_settings import RenderSettings
 from qsim.sensor.qis import QIS
 from qsim.streams.clip import Clip
-from qsim.streams.sensing import Sensing, prepare, sense, write_stream
+from qsim.streams.preparation import prepare
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense, write_stream
 from qsim.streams.stream import Stream, write_packed
+from qsim.streams.stream_info import StreamInfo
 
 BINARY = '[sensor]\nmodel = "BinarySPAD"\npde = 0.5\ndark_count_rate = 200.0\nbits = {bits}\n'
 COUNTING = '[sensor]\nmodel = "CountingSPAD"\npde = 0.5\ndark_count_rate = 10.0\ndead_time = 3e-4\nbits = {bits}\n'
@@ -79,17 +83,15 @@ def drawn(clip: Clip, folder: Path, kind: str) -> Stream:
 
 
 def stored_again(clip: Clip, stream: Stream, values: np.ndarray, **changes: object) -> Stream:
-    """Store a stream with other codes and the right checksums; keys that are None are left out."""
-    own = ("sha256", "checksum", "software", "format_version")
-    meta = {key: value for key, value in (stream.meta | changes).items() if key not in own and value is not None}
-    return write_stream(clip, stream.name, [values], stream.sensor, meta)
+    """Store a stream with other codes and the right checksums."""
+    return write_stream(clip, stream.name, [values], dataclasses.replace(stream.info, **changes))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_right_streams_pass_and_wrong_codes_are_counted(clip, tmp_path, kind):
     """With flipped codes in frames 1 and 2, all files still match their checksums."""
     stream = drawn(clip, tmp_path, kind)
-    assert stream.meta["drawn_by"] == KINDS[kind][2]
+    assert stream.info.drawn_by == KINDS[kind][2]
     (found,) = checking.redraw(stream.path)
     assert (found.differ, found.why, found.wrong) == (0, None, False)
     wrong = stream.codes()
@@ -164,11 +166,11 @@ def test_codes_of_the_shifted_sums_are_named(tmp_path, capsys):
 
 def test_streams_of_other_origin_and_damaged_ones_are_said_not_passed(clip, tmp_path, capsys):
     own = write_clip(tmp_path / "own", frames=3, height=8, width=9)
-    meta = {"shape": [3, 8, 9], "ppp_factor": None, "exposure": 5e-4, "frame_rate": 2000.0, "source": {"format": "npy"}}
-    write_stream(own, "imported", [np.ones((3, 8, 9), np.uint8)], QIS(0.8, 1.6, 0.2, 3), meta)
+    info = StreamInfo.of(QIS(0.8, 1.6, 0.2, 3), shape=(3, 8, 9), exposure=5e-4, frame_rate=2000.0)
+    write_stream(own, "imported", [np.ones((3, 8, 9), np.uint8)], info)
     assert program.main(["check", str(own.path), "--redraw"]) == 0
     out = capsys.readouterr().out
-    assert "imported.npy: not drawn again: its description holds no seed: it was not drawn from a clip by qsim" in out
+    assert "imported.npy: not drawn again: was not drawn from a clip by qsim" in out
     assert "drawn again: 0 of 1 streams, 0 codes; so nothing is known of them" in out
     stream, _ = sense(own, Sensing("quiver-physical", ppp=3.0, name="cut"))
     stream.path.write_bytes(stream.path.read_bytes()[:-20])
@@ -184,15 +186,15 @@ def test_streams_beside_no_clip_and_restored_video_do_not_end_the_check(clip, tm
     stream = drawn(clip, tmp_path, "QIS")
     capture, moved, video = (tmp_path / "out" / f"{name}.npy" for name in ("capture", "moved", "video"))
     capture.parent.mkdir()
-    meta = {"shape": list(stream.shape), "ppp_factor": None, "exposure": 5e-4, "frame_rate": 2000.0}
-    write_packed(capture, [stream.packed], stream.sensor, meta)
+    info = StreamInfo.of(stream.sensor, shape=stream.shape, exposure=5e-4, frame_rate=2000.0)
+    write_packed(capture, [stream.packed], info)
     for end in (".npy", ".json"):
         shutil.copy(stream.path.with_suffix(end), moved.with_suffix(end))
     np.save(video, np.ones(stream.shape, np.float32))
     describe_video(video.with_suffix(".json"), sha256=files.sha256(video))
     assert program.main(["check", *map(str, (stream.path, capture, moved, video)), "--redraw"]) == 0
     out = capsys.readouterr().out
-    assert f"{capture}: not drawn again: its description holds no seed" in out
+    assert f"{capture}: not drawn again: was not drawn from a clip by qsim" in out
     assert f"{moved}: not drawn again: {tmp_path}: not a clip folder" in out
     assert "drawn again: 1 of 3 streams" in out
 

@@ -19,7 +19,8 @@ from fakes import (
 from qsim.dataset import recipe
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import Options, generate
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 
 SENSOR = """[sensor]
 model = "BinarySPAD"

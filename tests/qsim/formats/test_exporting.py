@@ -51,7 +51,7 @@ def test_codes_through_our_stream_and_every_export(tmp_path: Path, bits: int, wi
         np.testing.assert_array_equal(everything(path, layout=layout, **said(layout, bits, width)), codes)
         side = path / "meta.json" if path.is_dir() else path.with_name(path.name + ".json")
         meta = json.loads(side.read_text())
-        assert (meta["bits"], meta["width"], meta["code_model"], meta["format_version"]) == (
+        assert (meta["bits"], meta["shape"][2], meta["code_model"], meta["format_version"]) == (
             bits,
             width,
             "binary_sum",
@@ -75,7 +75,7 @@ def test_codes_of_any_size_and_depth_come_back(
     np.save(folder / "codes.npy", values)
     stream = importing.to_stream(importing.read(folder / "codes.npy", Hints("codes", bits=bits)), folder / "s", CAPTURE)
     np.testing.assert_array_equal(stream.codes(), values)
-    assert (stream.meta["bit_order"], stream.meta["orientation"], stream.meta["width"]) == ("msb", "upright", shape[2])
+    assert (stream.info.orientation, stream.shape) == ("upright", shape)
     for kind in ("png", "zarr", "cube") if bits == 1 else ("png", "zarr"):
         path = exporting.export(stream, folder / kind, Export(kind))
         np.testing.assert_array_equal(everything(path, layout=kind, **said(kind, bits, shape[2])), values)
@@ -206,9 +206,8 @@ def test_an_export_states_what_decides_its_codes(tmp_path: Path):
     stream = clip.sense(BinarySPAD(0.4, 20.0), lux=50.0, defects=Defects(FixedPattern(dead=0.1)))
     exporting.export(stream, tmp_path / "a.npy", Export("cube"))
     meta = json.loads((tmp_path / "a.npy.json").read_text())
-    keys = ("defects", "origin", "ppp", "lux_target", "diffraction")
-    assert {key: meta[key] for key in keys} == {key: stream.meta[key] for key in keys}
-    assert (meta["origin"], meta["lux_target"]) == ([3, 4], 50.0)
+    assert (meta["defects"], meta["light"]["ppp"]) == (stream.info.defects, stream.info.light.ppp)
+    assert (meta["origin"], meta["settings"]) == ([3, 4], {"lux": 50.0})
 
 
 def test_an_export_does_not_replace_what_appeared_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -162,7 +162,7 @@ def test_codes_of_a_named_sensor_have_its_law(tmp_path: Path):
         (None, None, "binary_sum", 7), ("spad-320x240", None, "binary_sum", 7), ("quiver-physical", 3.25, "multibit", 1)
     ]:  # fmt: skip
         stream = importing.to_stream(recording, tmp_path / str(name), Import(1000.0, sensor=name, ppp=ppp))
-        assert (stream.meta["code_model"], stream.meta["planes_per_code"]) == (model, planes)
+        assert (stream.info.code_model, stream.info.planes_per_code) == (model, planes)
         assert stream.sensor.code_model == model
 
 
@@ -276,10 +276,10 @@ def test_a_stream_states_the_defects_and_the_filters_of_its_sensor(tmp_path: Pat
         importing.to_stream(codes, tmp_path / name, Import(1000, sensor=str(tmp_path / f"{name}.toml")))
         for name in ("plain", "my")
     )
-    assert not {"defects", "colour"} & plain.meta.keys()
+    assert (plain.info.defects, plain.info.colour) == ({}, None)
     assert plain.sensor.dark_rate == 20.0
     assert mine.colour_filter == ColourFilter(MASKS["quad"])
-    assert list(mine.meta["defects"]) == ["dark_map"]
+    assert list(mine.info.defects) == ["dark_map"]
     assert mine.sensor.dark_rate == 80.0
     np.testing.assert_array_equal(mine.codes(0, 4), plain.codes(0, 4))
 

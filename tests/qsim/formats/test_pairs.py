@@ -37,8 +37,8 @@ def test_a_data_set_becomes_windows_by_split(tmp_path: Path, capsys: pytest.Capt
                 assert clip.name in splits[split]
                 np.testing.assert_array_equal(group["codes"][n], stream[first : first + 5])
                 np.testing.assert_allclose(group["truth"][n], stream.truth(first, first + 5), rtol=1e-6)
-                assert (group["bits"][n], group["ppp"][n]) == (stream.bits, pytest.approx(stream.meta["ppp"]))
-                assert json.loads(group["sensor"].asstr()[n]) == stream.meta["sensor"]
+                assert (group["bits"][n], group["ppp"][n]) == (stream.bits, pytest.approx(stream.info.light.ppp))
+                assert json.loads(group["sensor"].asstr()[n]) == stream.info.sensor
                 rates = (group["exposure"][n], group["frame_rate"][n], group["code_model"].asstr()[n])
                 assert rates == (stream.exposure, 2000.0, stream.sensor.code_model)
                 seen.add((clip.name, stream.name, int(first)))

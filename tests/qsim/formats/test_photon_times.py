@@ -49,7 +49,7 @@ def test_counts_are_the_codes_and_dead_times_hold_exactly(tmp_path, case: int):
     (tmp_path / "d.toml").write_text(text or "[defects]\n")
     clip = moving(tmp_path / "c")
     stream = followed(clip, sensor, 9.0, defects=str(tmp_path / "d.toml") if text else None, slices=1 + case // 4)
-    assert stream.meta["drawn_by"] == "events"
+    assert stream.info.drawn_by == "events"
     assert photon_times.write(stream, tmp_path / "p.npz") > 100
     found = photon_times.read(tmp_path / "p.npz")
     np.testing.assert_array_equal(np.minimum(found.counts(), sensor.levels - 1), stream.codes())
@@ -110,7 +110,7 @@ def test_the_clocked_sensor_ignores_dead_time_and_afterpulses(tmp_path):
 def test_codes_that_were_not_followed_have_no_times(tmp_path, capsys):
     clip = moving(tmp_path / "c")
     clip.sense(CountingSPAD(0.5, 10.0, 0.0, 4), ppp=3.0, name="closed")
-    assert clip.stream("closed").meta["drawn_by"] == "closed form"
+    assert clip.stream("closed").info.drawn_by == "closed form"
     assert main(["convert", str(clip.path / "streams" / "closed.json"), str(tmp_path / "x.npz")]) == 2
     said = capsys.readouterr().err
     assert "were not drawn photon by photon; sense a CountingSPAD with --follow" in said
@@ -139,7 +139,7 @@ def test_rates_in_the_file_are_used_and_none_may_contradict(tmp_path, capsys):
         assert main([*words, *agreeing]) == 0
         assert "at 1000 per second, exposure 400 us" in capsys.readouterr().out
         stream = Stream.open(tmp_path / "clocked.json")
-        assert (stream.meta["frame_rate"], stream.exposure) == (1e3, 4e-4)
+        assert (stream.info.frame_rate, stream.exposure) == (1e3, 4e-4)
     for other, said in [
         (["--frame-rate", "2000"], "--frame-rate 2000: photon times state 1000; leave it out"),
         (["--exposure", "1e-3"], "--exposure 0.001: photon times state 0.0004; leave it out"),
@@ -156,13 +156,8 @@ def test_rows_at_their_own_time_are_stated(tmp_path):
     )
     assert photon_times.read(tmp_path / "p.npz").rows == Rows(5e-5, "up")
     assert main(["convert", str(tmp_path / "p.npz"), str(tmp_path / "clocked")]) == 0
-    assert Stream.open(tmp_path / "clocked.json").meta["source"] == {
-        "bit_order": "none: whole bytes per pixel",
-        "orientation": "upright",
-        "format": "photon times",
-        "row_delay": 5e-5,
-        "row_order": "up",
-    }
+    source = Stream.open(tmp_path / "clocked.json").info.source
+    assert (source.format, source.row_delay, source.row_order) == ("photon times", 5e-5, "up")
 
 
 def test_damaged_files_are_refused_in_one_line(tmp_path):

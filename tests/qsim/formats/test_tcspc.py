@@ -27,7 +27,7 @@ def test_ptu_images(tmp_path: Path):
     assert recording.bits == int(counts[..., 1].max()).bit_length()
     assert recording.exposure == pytest.approx(1e-5)
     stream = importing.to_stream(recording, tmp_path / "s", importing.Import(recording.frame_rate or 1.0))
-    assert stream.meta["code_model"] == "counting"
+    assert stream.info.code_model == "counting"
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(ValueError, match="not readable as PTU"):
         importing.read(path, Hints(channel=0))

@@ -14,7 +14,8 @@ from qsim.optics.radiometry import RGB
 from qsim.report import clip_section, report
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 
 DEVICES = {
     "dark map": '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 900.0\nbits = 2\n'
@@ -69,7 +70,7 @@ def test_no_expectation_is_shown_without_an_exact_one(tmp_path):
     bracketed, _ = sense(clip, Sensing("quiver-physical", ppp=2.0, name="bracketed", exposures=(1.0, 0.5)))
     assert "different exposures" in str(clip_section.unexpected(clip, bracketed))
     assert "; exposures of 1, 0.5 of a code's time in turn" in clip_section.stream_line(bracketed)
-    unknown = replace(stream, meta=stream.meta | {"ppp_factor": None, "defects": {}})
+    unknown = replace(stream, info=replace(stream.info, light=None, defects={}))
     assert "light is unknown" in str(clip_section.unexpected(clip, unknown))
 
 

@@ -222,7 +222,7 @@ def test_video_of_a_replaced_stream_is_not_scored_against_it(tmp_path):
     stream = clip.sense(ppp=3.25, bits=3, name="s")
     np.save(tmp_path / "v.npy", np.full((4, 12, 14), 3.25, np.float32))
     about = {"source": str(stream.path)}
-    known = {"shape": (4, 12, 14), "source_sha256": stream.meta["sha256"]}
+    known = {"shape": (4, 12, 14), "source_sha256": stream.info.sha256}
     for changes, scored in (
         (known, True),
         (known | {"source_sha256": "0" * 64}, False),

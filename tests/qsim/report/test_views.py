@@ -1,5 +1,7 @@
 """Tests that views are the declared functions of the numbers."""
 
+from dataclasses import replace
+
 import numpy as np
 from clips import describe_video, square_clip, write_clip
 
@@ -97,11 +99,7 @@ def test_planes_of_another_clip_are_one_code_per_frame(tmp_path):
     """Bit-depth studies state planes of their fast clip in the streams of its grouped one."""
     clip = write_clip(tmp_path / "c", frames=3, height=9, width=11)
     stream = clip.sense(ppp=3.0, bits=3, name="planes")
-    write_packed(stream.path, [stream.packed], stream.sensor, about(stream.meta) | {"planes_per_code": 7})
+    write_packed(stream.path, [stream.packed], replace(stream.info, planes_per_code=7))
     source = open_source(clip.path)
     assert slow_codes(source, stream) == [0, 1, 2]
     assert "each over" not in source.views["codes"].declared
-
-
-def about(meta: dict) -> dict:
-    return {key: value for key, value in meta.items() if key not in ("checksum", "sha256")}

@@ -15,8 +15,10 @@ from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from qsim.streams.stream import Stream, write_packed
+from qsim.streams.stream_info import StreamInfo
 
 SENSOR = QIS(0.7, 2.0, 0.3, 3, gain=0.8)
 
@@ -61,7 +63,7 @@ def test_defects_may_be_a_record(tmp_path: Path):
     stream = clip.sense(BinarySPAD(0.4, 20.0), ppp=30.0, defects=Defects(FixedPattern(dead=0.3)))
     dark = (stream.codes == 0).all(axis=0).mean()
     assert 0.1 < dark < 0.5
-    assert stream.meta["defects"]["dead"] == 0.3
+    assert stream.info.defects["dead"] == 0.3
 
 
 def test_a_stream_is_a_sequence_of_codes(tmp_path: Path):
@@ -115,11 +117,11 @@ def test_an_imported_stream_has_no_truth(tmp_path: Path):
     clip = write_clip(tmp_path / "c", frames=2, height=5, width=6)
     (clip.path / "streams").mkdir()
     packed = packing.pack(np.ones((2, 5, 6), np.uint8), SENSOR.bits)
-    meta = {"shape": [2, 5, 6], "ppp_factor": None, "exposure": 5e-4, "frame_rate": 2000.0}
+    info = StreamInfo.of(SENSOR, shape=(2, 5, 6), exposure=5e-4, frame_rate=2000.0)
     with pytest.raises(FileNotFoundError, match="does not lie in the folder of a clip"):
-        write_packed(tmp_path / "capture.npy", [packed], SENSOR, meta).truth()
+        write_packed(tmp_path / "capture.npy", [packed], info).truth()
     with pytest.raises(ValueError, match=r"capture\.npy: was imported, so its light is not known"):
-        write_packed(clip.path / "streams" / "capture.npy", [packed], SENSOR, meta).truth()
+        write_packed(clip.path / "streams" / "capture.npy", [packed], info).truth()
 
 
 def test_known_pixels_are_those_that_did_not_saturate(tmp_path: Path):
@@ -157,4 +159,4 @@ def test_files_are_named_by_text_or_path(tmp_path: Path):
     )
     assert np.array_equal(one.codes(), two.codes())
     description = one.path.with_suffix(".json")
-    assert Stream.open(str(description)).meta == Stream.open(description).meta
+    assert Stream.open(str(description)).info == Stream.open(description).info

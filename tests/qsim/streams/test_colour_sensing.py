@@ -17,8 +17,9 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
-from qsim.streams.sensing import Sensing, assemble, prepare, replay, sense
-from qsim.streams.simulation import stored
+from qsim.streams.preparation import assemble, prepare
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import replay, sense, stored
 
 SENSOR = """
 [sensor]
@@ -56,7 +57,7 @@ def test_a_stream_is_one_mosaic_that_can_be_drawn_again(place):
     assert [found.line() for found in redraw(place / "c")] == [None]
     assert stream.truth().shape == (3, 3, 7, 9)
     assert stream.truth().mean() == pytest.approx(4.0, rel=1e-3)
-    assert clip.sense("mine.toml", ppp=4.0).meta == stream.meta, "kept, not drawn again"
+    assert clip.sense("mine.toml", ppp=4.0).info == stream.info, "kept, not drawn again"
 
 
 def test_a_given_sensor_needs_no_file(place):
@@ -217,7 +218,7 @@ def test_a_recipe_reads_a_curve_of_efficiency_and_a_temperature(tmp_path):
     (wanted,) = load(tmp_path / "recipe.toml").jobs[0].streams
     clip = write_clip(tmp_path / "c", radiance=np.ones((40, 3, 24, 32), np.float32), bands=list(RGB))
     stream, _ = sense(clip, wanted)
-    assert stream.meta["temperature"] == 41.0
+    assert stream.info.temperature == 41.0
     points, values = np.array(CURVE).T
     for pixels, band in ((np.s_[::2, ::2], 0), (np.s_[::2, 1::2], 1), (np.s_[1::2, 1::2], 2)):
         codes = stream.codes()[:, *pixels]

@@ -15,7 +15,9 @@ from qsim.sensor.defects.fixed_pattern import FixedPattern
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.streams.exposures import gate
-from qsim.streams.sensing import Sensing, prepare, replay, sense
+from qsim.streams.preparation import prepare
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import replay, sense
 from qsim.studies.readouts import compare
 
 SCHEDULE = (1.0, 0.25, 0.0625)
@@ -59,7 +61,7 @@ def test_streams_keep_their_schedule(tmp_path, kind):
         np.testing.assert_array_equal(drawn, kept)
     (found,) = redraw(stream.path)
     assert (found.differ, found.why) == (0, None)
-    assert sense(clip, wanted)[0].meta == stream.meta
+    assert sense(clip, wanted)[0].info == stream.info
     with pytest.raises(FileExistsError, match="exists with other settings"):
         sense(clip, Sensing(sensor, ppp=6.0, name="s", exposures=SCHEDULE[:2], **how))
 

@@ -10,7 +10,8 @@ from qsim.clip.clip_info import RELATIVE
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.streams.photons import clip_photons, light_level, light_line
-from qsim.streams.sensing import Sensing, replay, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import replay, sense
 
 
 def test_photons_of_a_crop_are_the_crop_of_the_photons(tmp_path: Path):
@@ -79,8 +80,8 @@ def test_lux_of_a_video_are_those_of_a_camera_with_its_pixels(tmp_path: Path):
     wanted = light_level(camera, lux=2.0).ppp
     assert light_level(video, lux=2.0, pixel_pitch=pitch).ppp == pytest.approx(wanted)
     stream, line = sense(video, Sensing(BinarySPAD(0.5, 0.0, 2), lux=2.0, pixel_pitch=pitch, group=True))
-    assert stream.meta["pixel_pitch"] == pitch
-    assert stream.meta["ppp"] == pytest.approx(3 * wanted)
+    assert stream.info.sensing.pixel_pitch == pitch
+    assert stream.info.light.ppp == pytest.approx(3 * wanted)
     assert "equivalent to 2 lx at 555 nm" in line
     np.testing.assert_array_equal(*replay(video, stream, 0))
     with pytest.raises(FileExistsError, match="other settings"):

@@ -13,8 +13,10 @@ from qsim.dataset.checking import redraw
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.preparation import prepare
 from qsim.streams.rows import Rows
-from qsim.streams.sensing import Sensing, prepare, replay, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import replay, sense
 
 RATE = 2000.0
 COUNTER = CountingSPAD(pde=0.5, dark_count_rate=10.0, dead_time=0.0, bits=6)
@@ -124,7 +126,7 @@ def test_streams_keep_their_readout(tmp_path, kind):
         np.testing.assert_array_equal(drawn, kept)
     (found,) = redraw(stream.path)
     assert (found.differ, found.why) == (0, None)
-    assert sense(clip, Sensing(sensor, ppp=4.0, name="s", **rows, **how))[0].meta == stream.meta
+    assert sense(clip, Sensing(sensor, ppp=4.0, name="s", **rows, **how))[0].info == stream.info
     for other in ({}, {"row_delay": 3e-5}):
         with pytest.raises(FileExistsError, match="exists with other settings"):
             sense(clip, Sensing(sensor, ppp=4.0, name="s", **other, **how))

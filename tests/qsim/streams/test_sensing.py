@@ -17,7 +17,8 @@ from clips import write_clip
 
 from qsim.streams import stream
 from qsim.streams.clip import Clip
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 
 FORK = multiprocessing.get_context("fork")  # everything is imported already: the processes start together
 
@@ -38,13 +39,13 @@ def sense_again(path: Path, seed: int, seconds: float, answers: multiprocessing.
     while time.monotonic() < end:
         if seed < 4:
             made, _ = sense(clip, Sensing("quiver-physical", 3, 3.25, seed=seed, name="same"), force=True)
-            found["made"] += made.meta["seed"] == seed
+            found["made"] += made.info.seed == seed
         try:
             opened = clip.stream("same")
             time.sleep(rng.choice([0, 0.001, 0.01]))
             content = checksum(opened.packed)
             time.sleep(rng.choice([0, 0.01]))
-            found["intact" if content == opened.meta["sha256"] == checksum(opened.packed) else "mixed"] += 1
+            found["intact" if content == opened.info.sha256 == checksum(opened.packed) else "mixed"] += 1
         except ValueError as error:
             found["replaced" if "was replaced since it was opened" in str(error) else str(error)] += 1
         except FileNotFoundError:
@@ -92,7 +93,7 @@ def sense_first(path: Path, start: float, answers: multiprocessing.Queue) -> Non
             progress=lambda done, total: drawn.append(done),
             on_wait=lambda: waits.append(1),
         )
-        answers.put((made.meta["sha256"], checksum(made.packed), bool(drawn), len(waits)))
+        answers.put((made.info.sha256, checksum(made.packed), bool(drawn), len(waits)))
     except BaseException as error:
         answers.put(repr(error))
 
@@ -131,9 +132,9 @@ def test_failed_sensing_keeps_the_old_stream(tmp_path: Path, monkeypatch: pytest
     old, _ = sense(clip, wanted)
     blocks = iter([old.packed[:1]])
     with pytest.raises(ValueError, match="got 1 frames, expected 3"):
-        stream.write_packed(clip.path / "streams" / "same.npy", blocks, old.sensor, old.meta)
+        stream.write_packed(clip.path / "streams" / "same.npy", blocks, old.info)
     assert clip.verify() == []
-    assert clip.stream("same").meta == old.meta
+    assert clip.stream("same").info == old.info
 
 
 def test_two_light_levels_share_their_random_numbers_and_another_seed_does_not(tmp_path: Path):

@@ -19,8 +19,9 @@ from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
-from qsim.streams.sensing import Sensing, describe, prepare, replay, sense, write_stream
-from qsim.streams.simulation import stored
+from qsim.streams.preparation import prepare
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import describe, replay, sense, stored, write_stream
 
 
 @pytest.fixture
@@ -143,14 +144,14 @@ def test_a_crop_has_the_defects_and_the_noise_of_its_place(tmp_path, kind, place
     (whole, crop), (y, x), (sensor, how) = whole_and_crop(tmp_path, place), place, CROPPED[kind]
     expected = sense(whole, Sensing(sensor, name="s", **how))[0]
     stream = sense(crop, Sensing(sensor, name="s", **how))[0]
-    assert "origin" not in expected.meta
-    assert stream.meta["origin"] == [y, x]
+    assert expected.origin == (0, 0)
+    assert stream.origin == (y, x)
     assert 0 < stream.codes().mean() < sensor.levels - 1
     np.testing.assert_array_equal(stream.codes(), expected.codes()[:, y : y + 7, x : x + 9])
     np.testing.assert_array_equal(*replay(crop, stream, 1))
     again = replace(stored(stream), engine="reference").frames(crop, 0, len(stream))
     np.testing.assert_array_equal(again, stream.codes())
-    assert sense(crop, Sensing(sensor, name="s", **how))[0].meta == stream.meta, "kept, not drawn again"
+    assert sense(crop, Sensing(sensor, name="s", **how))[0].info == stream.info, "kept, not drawn again"
 
 
 @needs_engine
@@ -178,14 +179,12 @@ def test_the_times_of_photons_of_a_crop_are_those_of_its_place(tmp_path):
             np.testing.assert_array_equal(found, expected)
 
 
-def test_a_crop_of_an_earlier_version_is_drawn_again_as_it_was(tmp_path):
-    """Its description holds no origin: its defects and noise are those of the upper left corner."""
+def test_a_crop_is_drawn_again_at_the_place_that_its_description_states(tmp_path):
+    """Without an origin, defects and noise are those of the upper left corner."""
     _, crop = whole_and_crop(tmp_path, (3, 4))
     wanted = Sensing(BITS3, name="s", defects=Defects(PATTERN))
     draw = replace(prepare(crop, wanted), origin=(0, 0))
-    meta = describe(crop, wanted, draw)
-    assert "origin" not in meta
-    old = write_stream(crop, "s", draw.blocks(crop, 0, 6, 6), draw.sensor, meta)
+    old = write_stream(crop, "s", draw.blocks(crop, 0, 6, 6), describe(crop, wanted, draw))
     assert (old.codes() != prepare(crop, wanted).frames(crop, 0, 6)).any()
     np.testing.assert_array_equal(*replay(crop, old, 2))
     with pytest.raises(FileExistsError, match="exists with other settings"):

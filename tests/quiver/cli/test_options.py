@@ -19,7 +19,8 @@ from safetensors.numpy import load_file
 
 from qsim import figures
 from qsim.sensor import devices
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver import threads
 from quiver.baselines import METHODS
 from quiver.cli import program

@@ -84,7 +84,8 @@ def test_static_photons(capsys):
 
 
 def test_a_stored_stream_by_clip_by_name_and_by_file(capsys, make_clip, tmp_path):
-    from qsim.streams.sensing import Sensing, sense
+    from qsim.streams.sensing import Sensing
+    from qsim.streams.storing import sense
 
     clip = make_clip()
     sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, name="mine"))

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from clips import write_dataset
 
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.data.clips import open_clips
 
 

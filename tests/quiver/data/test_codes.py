@@ -14,7 +14,8 @@ from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.data.clips import open_clips, truth
 from quiver.data.codes import array_codes, frame_reader, light_of, sensed
 from quiver.data.illumination import Illumination
@@ -49,7 +50,7 @@ def test_counting_pixels_with_a_memory_are_followed_as_by_qsim_sense(make_clip: 
     file = sensor_file(tmp_path, COUNTER.replace("1e-5", "1e-4") + table, bits=3)
     now = sensed(clip, Illumination.of(file, 3.0, None))[0]
     stored = sense(clip, Sensing(file, ppp=3.0))[0]
-    assert stored.meta["drawn_by"] == "events"
+    assert stored.info.drawn_by == "events"
     np.testing.assert_array_equal(now.read(0, 4), stored.codes(0, 4))
     np.testing.assert_array_equal(now.read(2, 3), stored.codes(2, 3))
 

@@ -15,7 +15,8 @@ from qsim.keys import Key
 from qsim.sensor import qis
 from qsim.sensor.defects.fixed_pattern import FixedPattern, draw_maps
 from qsim.sensor.spad import BinarySPAD
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.baselines import METHODS
 from quiver.data.codes import array_codes, filled, light_of, sensed, stream_codes
 from quiver.data.defects import Filler, read_map, skips_codes
@@ -140,16 +141,16 @@ def test_a_stream_states_its_dead_and_hot_pixels(make_clip: ClipMaker, tmp_path)
 
 
 def test_a_crop_has_the_defective_pixels_of_its_place(make_clip: ClipMaker, tmp_path):
-    """Sensed now, stored, and stored by an earlier version, which drew every crop as one at (0, 0)."""
+    """Sensed now, stored, and stored as one at (0, 0)."""
     clip = make_clip(frames=2, height=20, width=21, origin=[6, 9])
     path = sensor_file(tmp_path, SPAD + "dead = 0.1\n", bits=3)
     stream = sense(clip, Sensing(path, 3, ppp=3.25))[0]
     whole = draw_maps(FixedPattern(dead=0.1), (26, 30)).dead
     now, _ = sensed(clip, Illumination.of(path, 3.25, 3))
-    earlier = replace(stream, meta={key: value for key, value in stream.meta.items() if key != "origin"})
+    corner = replace(stream, info=replace(stream.info, origin=(0, 0)))
     np.testing.assert_array_equal(now.defective, whole[6:, 9:])
     np.testing.assert_array_equal(stream_codes(stream).defective, whole[6:, 9:])
-    np.testing.assert_array_equal(stream_codes(earlier).defective, whole[:20, :21])
+    np.testing.assert_array_equal(stream_codes(corner).defective, whole[:20, :21])
 
 
 @pytest.mark.parametrize("model", [QIS, COUNTER], ids=["QIS", "COUNTER"])

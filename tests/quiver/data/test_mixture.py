@@ -12,7 +12,8 @@ from clips import ClipMaker
 from sensor_files import COUNTER, QIS, sensor_file
 
 from qsim.streams.photons import clip_photons, light_level
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.cli.program import main
 from quiver.data.clips import open_clips
 from quiver.data.illumination import Illumination

@@ -14,7 +14,9 @@ from clips import ClipMaker
 from sensor_files import QIS, sensor_file
 
 from qsim.settings import settings_of
-from qsim.streams.sensing import Sensing, prepare, sense
+from qsim.streams.preparation import prepare
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.data.clips import open_clips
 from quiver.data.illumination import HONOURED, Illumination, labels
 from quiver.data.windows import Windows, WindowSettings

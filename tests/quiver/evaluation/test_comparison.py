@@ -19,7 +19,8 @@ from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.optics.radiometry import RGB
 from qsim.streams.clip import Clip
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.cli.program import main
 from quiver.data.clips import known, open_clips, truth
 from quiver.data.codes import Codes, sensed, stream_codes
@@ -380,7 +381,8 @@ def test_published_windows_of_a_spike_camera_are_refused(tiny_dataset, tmp_path,
 
 
 def test_stored_streams_are_scored(tiny_dataset, make_clip: ClipMaker):
-    from qsim.streams.sensing import Sensing, sense
+    from qsim.streams.sensing import Sensing
+    from qsim.streams.storing import sense
 
     clip = make_clip()
     sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, name="mine"))

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from clips import ClipMaker, packed
 
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 
 
 @pytest.fixture

@@ -17,7 +17,8 @@ from qsim.keys import Key
 from qsim.sensor import devices
 from qsim.sensor.colour_filter import MASKS, ColourFilter
 from qsim.sensor.qis import QIS
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.baselines import METHODS
 from quiver.data.clips import open_clips
 from quiver.data.codes import Codes, array_codes, light_of

@@ -20,7 +20,8 @@ from numpy import ndarray as Array
 
 from qsim.scratch import sweep
 from qsim.sensor.qis import QIS
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.cli.program import main
 from quiver.data.codes import Codes, array_codes, open_stream, sensed, stream_codes
 from quiver.data.illumination import Illumination

@@ -7,7 +7,8 @@ import pytest
 from sensor_files import SPAD, sensor_file
 
 import quiver
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.cli.program import main
 from quiver.data.codes import array_codes, repaired, sensed, stream_codes
 from quiver.data.illumination import Illumination, read_sensor

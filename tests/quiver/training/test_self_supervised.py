@@ -21,7 +21,8 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.baselines import moment
 from quiver.cli.program import main
 from quiver.data.codes import Codes, array_codes

@@ -15,7 +15,8 @@ from random_codes import random_codes
 from runs import TINY, same_weights, settings, tiny, tiny_settings
 from torch import Tensor
 
-from qsim.streams.sensing import Sensing, sense
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import sense
 from quiver.data.clips import open_clips
 from quiver.data.codes import Codes
 from quiver.data.noise_table import noise_table

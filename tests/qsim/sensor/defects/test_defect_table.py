@@ -14,7 +14,9 @@ from qsim.sensor import devices
 from qsim.sensor.defects import defect_table, event_simulation, fixed_pattern
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.streams.photons import clip_photons
-from qsim.streams.sensing import Sensing, assemble, prepare, replay, sense
+from qsim.streams.preparation import assemble, prepare
+from qsim.streams.sensing import Sensing
+from qsim.streams.storing import replay, sense
 
 BINARY = '[sensor]\nmodel = "BinarySPAD"\npde = 0.5\ndark_count_rate = 200.0\nbits = 1\n'
 COUNTING = '[sensor]\nmodel = "CountingSPAD"\npde = 0.5\ndark_count_rate = 10.0\ndead_time = 5e-5\nbits = 3\n'
@@ -42,7 +44,7 @@ def test_defects_that_are_off_change_no_bit_and_are_not_stored(clip, tmp_path, s
     plain = drawn(clip, device(tmp_path, sensor))[0].codes()
     stream, _ = drawn(clip, device(tmp_path, sensor, table))
     np.testing.assert_array_equal(stream.codes(), plain)
-    assert "defects" not in stream.meta
+    assert not stream.info.defects
 
 
 def test_a_stream_holds_the_codes_that_the_device_draws(clip, tmp_path):
@@ -110,7 +112,7 @@ def test_light_that_changes_inside_an_exposure_is_followed_photon_by_photon(tmp_
     stream, line = drawn(clip, sensor, slices=3)
     assert len(stream) == 2
     assert stream.exposure == pytest.approx(3 * clip.exposure)
-    assert stream.meta["drawn_by"] == "events"
+    assert stream.info.drawn_by == "events"
     assert "varying flux" in line
     assert "photon by photon" in line
     light = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(6)]).reshape(2, 3, 4, 5)
@@ -123,7 +125,7 @@ def test_light_that_changes_inside_an_exposure_is_followed_photon_by_photon(tmp_
         memory=event_simulation.Memory(carry=True),
     )
     assert who == "events"
-    assert stream.meta["dead_time_effects"] == pytest.approx(vars(found))
+    assert vars(stream.info.dead_time_effects) == pytest.approx(vars(found))
     np.testing.assert_array_equal(stream.codes(), expected)
     np.testing.assert_array_equal(*replay(clip, stream, 1))
 
@@ -133,7 +135,7 @@ def test_followed_photons_have_crosstalk_too(clip, tmp_path):
     plain = drawn(clip, device(tmp_path, COUNTING), follow=True)[0].codes()
     stream, line = drawn(clip, device(tmp_path, COUNTING, "crosstalk = 0.2"), follow=True)
     assert "defects: crosstalk" in line
-    assert stream.meta["drawn_by"] == "events"
+    assert stream.info.drawn_by == "events"
     assert (stream.codes() >= plain).all()
     assert stream.codes().mean() > 1.2 * plain.mean()
     np.testing.assert_array_equal(*replay(clip, stream, 3))
@@ -143,7 +145,7 @@ def test_effects_below_the_tolerance_take_the_closed_form(tmp_path):
     clip = write_clip(tmp_path / "still", radiance=np.ones((6, 4, 5)))
     sensor = device(tmp_path, COUNTING.replace("5e-5", "1e-9"), "carry_dead_time = true")
     stream, line = drawn(clip, sensor, slices=2)
-    assert stream.meta["drawn_by"] == "closed form"
+    assert stream.info.drawn_by == "closed form"
     assert "closed form" in line
     light = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(6)]).reshape(3, 2, 4, 5)
     expected = devices.load(sensor).sample(light.sum(axis=1), 2 * clip.exposure, key=Key(0, hash_name("still")))

@@ -29,7 +29,7 @@ def hot_stream(folder, more: str = "", model: str = QIS):
 def test_light_of_good_pixels_is_found_beside_hot_ones(tmp_path):
     """Within five sigma of photon noise; the mean rate of all pixels makes it 1.2 of 3 photons too low."""
     stream = hot_stream(tmp_path)
-    sensor, left = good_pixels.of_stream(stream.sensor, stream.meta)
+    sensor, left = stream.good_pixels()
     assert left == "not inverted: dark rates of single pixels"
     assert sensor.dark_rate == pytest.approx(20.0)
     good = np.ones(SIZE, bool)
@@ -42,10 +42,10 @@ def test_light_of_good_pixels_is_found_beside_hot_ones(tmp_path):
 
 def test_the_rest_is_named(tmp_path):
     stream = hot_stream(tmp_path, "crosstalk = 0.05\ndead = 0.1\ndevice_seed = 3\n", SPAD)
-    _, left = good_pixels.of_stream(stream.sensor, stream.meta)
+    _, left = stream.good_pixels()
     assert left == "not inverted: crosstalk, dark rates of single pixels, dead"
     np.save(tmp_path / "rates.npy", np.ones(SIZE))
-    sensor, left = good_pixels.of_stream(stream.sensor, stream.meta)
+    sensor, left = stream.good_pixels()
     assert sensor == stream.sensor
     assert left.startswith("no defect is inverted: ")
     assert left.endswith("rates.npy has changed since the stream was drawn")
@@ -53,7 +53,7 @@ def test_the_rest_is_named(tmp_path):
 
 def test_a_stream_without_defects_keeps_its_sensor(tmp_path):
     stream = write_clip(tmp_path / "c", frames=2, height=6, width=7).sense("spad512s", ppp=1.0, name="s")
-    assert good_pixels.of_stream(stream.sensor, stream.meta) == (stream.sensor, "")
+    assert stream.good_pixels() == (stream.sensor, "")
 
 
 @pytest.mark.parametrize("origin", [(0, 0), (7, 3)])

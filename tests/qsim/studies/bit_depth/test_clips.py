@@ -57,7 +57,7 @@ def test_codes_of_summed_planes_belong_to_the_frames_of_their_own_clip(clip, tmp
     grouped = Clip.open(path)
     planes = grouped.stream("planes")
     multibit = grouped.stream("multibit")
-    assert planes.meta["ppp_target"] == pytest.approx(7 * 0.65)
+    assert planes.info.light.ppp == pytest.approx(7 * 0.65)
     for t in (0, len(grouped) - 1):
         middle = clip_photons(clip, 7 * t + 3, 7 * factor, sharp=True)
         np.testing.assert_allclose(planes.truth(t, t + 1)[0], middle, rtol=1e-6)
@@ -69,7 +69,7 @@ def test_codes_of_summed_planes_belong_to_the_frames_of_their_own_clip(clip, tmp
     (again, other) = sorted(redraw(path), key=lambda one: one.path.name, reverse=True)
     assert "was not drawn from a clip" in again.why
     assert (other.why, other.differ) == (None, 0)
-    assert "sensor_name" not in planes.meta  # no device is called so; the record has all
+    assert planes.info.sensor_name == ""  # no device is called so; the record has all
 
 
 def test_another_clip_in_the_place_of_a_rendered_one_is_refused(tmp_path):
@@ -115,7 +115,7 @@ def test_streams_of_a_sensor_file_have_every_depth(clip, tmp_path):
     made = write_streams(clip, tmp_path, StudySettings(bits=(1, 3), sensor=str(file), ppp=0.65))
     streams = [Clip.open(path).stream("multibit") for path in made]
     assert [stream.bits for stream in streams] == [1, 3]
-    assert all(stream.sensor.efficiency == 0.4 and "defects" not in stream.meta for stream in streams)
+    assert all(stream.sensor.efficiency == 0.4 and not stream.info.defects for stream in streams)
     file.write_text(f"{text}[defects]\nprnu = 0.02\n")
     with pytest.raises(ValueError, match=r"spad\.toml: .* without the table"):
         write_streams(clip, tmp_path / "other", StudySettings(bits=(3,), sensor=str(file), ppp=0.65))

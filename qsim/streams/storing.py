@@ -1,0 +1,176 @@
+"""Stores streams: draws what a `Sensing` asks of a clip, keeps what is stored already, and replays stored frames.
+
+clip (radiance) --light level, optics--> photons --sensor, key--> codes --> streams/NAME.npy + streams/NAME.json
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+
+from numpy import ndarray as Array
+
+from qsim import locks, scratch
+from qsim.clip.clip_folder import ClipFolder
+from qsim.files import Progress, check_name
+from qsim.keys import Key
+from qsim.optics.radiometry import LightLevel
+from qsim.sensor import devices, file_laws, packing
+from qsim.sensor.defects.event_simulation import TOLERANCE
+from qsim.sensor.sensor import Sensor
+from qsim.streams.drawing import DRAWERS
+from qsim.streams.photons import light_line
+from qsim.streams.preparation import followed, prepare
+from qsim.streams.sensing import Sensing
+from qsim.streams.simulation import Draw
+from qsim.streams.stream import Stream, write_packed, writing
+from qsim.streams.stream_info import StreamInfo, StreamLight, stored_settings
+
+
+def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> StreamInfo:
+    """Return the description of the stream of a draw, without what its writer adds."""
+    _, height, width = clip.shape
+    level = draw.level
+    return StreamInfo.of(
+        draw.sensor,
+        sensor_name="" if isinstance(sensing.sensor, Sensor) else sensing.sensor,
+        shape=(len(draw.exposures(clip)), height, width),
+        frame_rate=clip.frame_rate / draw.planes,
+        exposure=clip.exposure * draw.planes,
+        planes_per_code=draw.planes,
+        defects={} if draw.defects is None else draw.defects.to_dict(),
+        colour=draw.colour,
+        origin=draw.origin,
+        temperature=file_laws.temperature_of(devices.table_of(sensing.sensor), sensing.temperature),
+        settings=stored_settings(sensing),
+        clip=clip.name,
+        clip_key=draw.key.clip,
+        light=StreamLight(
+            factor=level.factor, ppp=level.ppp * draw.planes, before=level.mean_before * draw.planes, lux=level.lux
+        ),
+        drawn_by=draw.law,
+        orientation=clip.info.orientation,
+    )
+
+
+def stored(stream: Stream) -> Draw:
+    """Return the draw of a stored stream, from its description; `ValueError` for one that qsim did not draw."""
+    info = stream.info
+    if info.light is None or info.clip_key is None or not info.drawn_by:
+        raise ValueError(f"{stream.path}: was not drawn from a clip by qsim, so its description cannot draw it again")
+    if info.drawn_by not in DRAWERS:
+        known = ", ".join(DRAWERS)
+        raise ValueError(f"{stream.path}: drawn by {info.drawn_by!r}, which is none of {known}; sense it again")
+    timing = stream.timing
+    level = LightLevel(info.light.factor, info.light.ppp / timing.frames, info.light.before / timing.frames, None)
+    sensing = info.sensing
+    return Draw(
+        stream.sensor,
+        level,
+        Key(seed=sensing.seed, clip=info.clip_key),
+        timing,
+        sensing.diffraction,
+        stream.defects,
+        info.dead_time_effects if info.drawn_by == "events" else None,
+        colour=info.colour,
+        origin=info.origin,
+    )
+
+
+def sense(
+    clip: ClipFolder,
+    sensing: Sensing,
+    *,
+    force: bool = False,
+    progress: Progress | None = None,
+    on_wait: Callable[[], None] | None = None,
+) -> tuple[Stream, str]:
+    """Draw and store a stream; return it and a one-line summary of its light level.
+
+    A stream of this name is kept if its settings are the same; `FileExistsError` for other settings without `force`.
+    While another process senses this clip, wait after a call of `on_wait`.
+    """
+    if isinstance(sensing.sensor, Sensor):
+        devices.check_known(sensing.sensor)
+    draw, missed = followed(clip, sensing, prepare(clip, sensing))
+    info = dataclasses.replace(describe(clip, sensing, draw), dead_time_effects=missed)
+    efficiency = draw.sensor.efficiency
+    whole = dataclasses.replace(draw.level, ppp=draw.level.ppp * draw.planes)  # of a code, not of a clip frame
+    line = light_line(whole, efficiency, draw.colour, clip.bands)
+    if draw.colour is not None:
+        line += f"; {draw.colour.words(efficiency)}"
+    line += draw.timing.words()
+    line += draw.exposures(clip).about_flicker(clip.strengths)
+    if draw.timing.rows is None and draw.planes % 2 == 0:
+        line += "; its truth is half a clip frame late, which an odd number of slices avoids"
+    if draw.defects is not None:
+        effects = [key for key, value in draw.defects.to_dict().items() if value and key != "device_seed"]
+        line += f"; defects: {', '.join(effects) or 'none'}"
+    if missed is not None:
+        line += f"; {missed}: {'photon by photon' if draw.followed else 'below ' + str(TOLERANCE) + ', closed form'}"
+    kept = None if force else _kept(clip, sensing, info)
+    if kept is not None:
+        _tidy(clip)
+        return kept, line
+    with writing(clip.path / "streams", on_wait):
+        kept = None if force else _kept(clip, sensing, info)  # another process may have made it
+        if kept is not None:
+            return kept, line
+        blocks = draw.packed(clip, info.shape[0], progress)
+        return _write(clip, sensing.stream_name, blocks, info), line
+
+
+def _kept(clip: ClipFolder, sensing: Sensing, info: StreamInfo) -> Stream | None:
+    """Return the stored stream if its settings are these, None if there is none; `FileExistsError` for others."""
+    json_path = clip.path / "streams" / f"{sensing.stream_name}.json"
+    try:
+        old = Stream.open(json_path)
+    except FileNotFoundError:
+        return None
+    if old.info.compared == info.compared:
+        return old
+    raise FileExistsError(f"{json_path}: exists with other settings; name this stream with --name, or use --force")
+
+
+def replay(clip: ClipFolder, stream: Stream, frame: int) -> tuple[Array, Array]:
+    """Return one frame drawn again from the stream's json, and the stored frame: codes [H, W] each."""
+    if not 0 <= frame < len(stream):
+        raise ValueError(f"{stream.path}: frame {frame} does not exist; the stream has frames 0..{len(stream) - 1}")
+    return stored(stream).frames(clip, frame, frame + 1)[0], stream.codes(frame, frame + 1)[0]
+
+
+def write_stream(clip: ClipFolder, name: str, codes_iter: Iterable[Array], info: StreamInfo) -> Stream:
+    """Store codes ([H, W] frames or [t, H, W] blocks, in order) as a stream of `clip`; the json is written last.
+
+    `ValueError` if there are not as many frames as `info` states.
+    """
+    shape = info.shape[1:]
+
+    def packed() -> Iterator[Array]:
+        done = 0
+        for block in codes_iter:
+            block = block if block.ndim == 3 else block[None]
+            if block.shape[1:] != shape:
+                raise ValueError(f"{clip.path}, {name}: frame {done} is {block.shape[1:]}, expected {shape}")
+            yield packing.pack(block, info.bits)
+            done += len(block)
+
+    with writing(clip.path / "streams"):
+        return _write(clip, name, packed(), info)
+
+
+def _write(clip: ClipFolder, name: str, blocks: Iterable[Array], info: StreamInfo) -> Stream:
+    """Store packed blocks as a stream of the clip; the caller holds the lock of its streams."""
+    path = clip.path / "streams" / f"{check_name(name)}.npy"
+    scratch.sweep(path.parent)
+    return write_packed(path, blocks, info)
+
+
+def _tidy(clip: ClipFolder) -> None:
+    """Delete what a writer left that was killed after its stream was written."""
+    scratch.sweep(clip.path / "streams")
+    lock = locks.Lock(clip.path / "streams" / "lock")
+    with contextlib.suppress(OSError):  # a read-only folder
+        if lock.path.exists() and lock.acquire():
+            lock.delete()
