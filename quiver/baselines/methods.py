@@ -17,6 +17,7 @@ from typing import Any
 from numpy import ndarray as Array
 
 from quiver.baselines.sliding_window import look_ahead
+from quiver.host import own_numbers
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Method:
     bytes_per_pixel: int  # working memory, about, beside the codes and the video
     description: str
 
+    @own_numbers
     def restore(self, *given: Any, **settings: Any) -> Array:
         """Restore codes by the function of this method, which has the signature above."""
         module, _, function = self.home.partition(":")

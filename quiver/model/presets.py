@@ -9,6 +9,7 @@ import torch
 from torch import nn
 from torch.overrides import TorchFunctionMode
 
+from quiver.host import own_numbers
 from quiver.model import names
 from quiver.model.config import Config
 from quiver.model.quiver import QUIVER
@@ -75,6 +76,7 @@ def parameter_count(config: Config) -> int:
         return sum(parameter.numel() for parameter in QUIVER(config).parameters())
 
 
+@own_numbers
 def build(name: str) -> nn.Module:
     """Return a network by its name, with random weights; ValueError for other names."""
     if name not in PRESETS:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from qsim.files import write_bytes
 from qsim.thread_warnings import warnings_here
+from quiver.host import own_numbers
 from quiver.model.presets import NETWORKS, WithoutValues
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files
@@ -69,6 +70,7 @@ def save(network: nn.Module, config: Any, path: Path, notes: Mapping[str, str] |
     write_bytes(path, to_safetensors(tensors, metadata))
 
 
+@own_numbers
 def load(path: Path) -> nn.Module:
     """Return the network stored by `save`, on the CPU, in evaluation mode; ValueError for any other file.
 

@@ -15,6 +15,7 @@ from qsim.settings import setting, settle
 from qsim.words import memory_size
 from quiver.data.codes import Codes, light_of
 from quiver.device import DEVICES, HOST_MEMORY, default_memory, pick_device
+from quiver.host import own_numbers
 from quiver.model.names import NETWORKS as NETWORKS
 from quiver.model.names import QUIVERS as QUIVERS
 from quiver.restoration.domain import UP_TO_A_FACTOR, Scope, place_of, remark
@@ -95,6 +96,7 @@ class Restorer:
         self.into(codes, out, first, progress)
         return out
 
+    @own_numbers
     def into(self, codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
         """Write what `restore` returns of frames `first` ... into `out`, zeros of that shape."""
         if codes.colour is None:
