@@ -121,7 +121,7 @@ def _of_stream(given: Mapping[str, Any], settings: Settings) -> Settings:
     from quiver.data.stream_windows import stream_at
     from quiver.training.self_supervised import own_light
 
-    for name in ("sensor", "ppp", "bits", "validate_every", "validation_split"):
+    for name in ("sensor", "ppp", "bits", "temperature", "validate_every", "validation_split"):
         if name in given:
             why = f"is for data sets, and {settings.network} learns from one stream"
             raise ArgumentError(name, f"{why}; leave it out")
@@ -207,7 +207,9 @@ class Ablate:
 def ablate(
     asked: Ablate,
     given: Annotated[
-        dict[str, Any], Settings, "steps", "minutes", "sensor", "ppp", "bits", "crop", "batch", "seed", "threads"
+        dict[str, Any],
+        Settings,
+        *("steps", "minutes", "sensor", "ppp", "bits", "temperature", "crop", "batch", "seed", "threads"),
     ],
     options: RestoreOptions,
 ) -> int:

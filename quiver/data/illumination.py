@@ -155,6 +155,8 @@ class Illumination:
             made = replace(sensing, sensor=self.sensor, bits=sensing.sensor.bits, defects=None)
             return Illumination(made, as_text(sensing.sensor.to_dict()), defects)
         if file is None:
+            if sensing.temperature is not None:
+                self.device(5e-4)  # raises: a named device has no law of temperature
             return Illumination(replace(sensing, defects=None), None, defects)
         bits = devices.load(file, bits=sensing.bits).bits
         record = as_text({**_with_own_spread(file, found), "bits": bits})
@@ -185,7 +187,7 @@ class Illumination:
     def others(self) -> list[str]:
         """The settings beside sensor, light and bits, as text: `diffraction`, `temperature 40`."""
         rest = {name: value for name, value in given(self.sensing).items() if name not in (*LEVEL, "seed", "name")}
-        return [name if value is True else f"{name} {value}" for name, value in rest.items()]
+        return [name if value is True else f"{name} {_short(value)}" for name, value in rest.items()]
 
     @property
     def light(self) -> str:
@@ -199,6 +201,11 @@ class Illumination:
         """The text of tables: `3.25 PPP, 3 bit`."""
         bits = "own bits" if self.bits is None else f"{self.bits} bit"
         return ", ".join([self.light, bits, *self.others])
+
+
+def _short(value: object) -> str:
+    """Return the value of a setting as text."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _with_own_spread(file: str, found: Defects | None) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from qsim.checks import ArgumentError
 from qsim.streams.clip import Clip
 from qsim.streams.stream import Stream
 from quiver.data.illumination import Illumination, as_text, short_name, unlike_windows
@@ -33,13 +34,16 @@ def choose(
     sensors: Sequence[str] | None = None,
     ppp: Sequence[float] | None = None,
     bits: Sequence[int] | None = None,
+    temperature: float | None = None,
 ) -> Mixture:
     """Return the noise of the clips' streams, changed to the requested sensors, light levels [photons/pixel] and bits.
 
     A requested sensor has the light, bits and defects of its streams. Without any, it has light and bits of other
-    streams, and the defects of its file. Without streams, the default sensor and light are used. `ValueError` for a
-    stream whose noise training windows cannot have.
+    streams, and the defects of its file, at `temperature` [degrees C]. Without streams, the default sensor and light
+    are used. `ValueError` for a stream whose noise training windows cannot have, and for a temperature without sensors.
     """
+    if temperature is not None and not sensors:
+        raise ArgumentError("temperature", "is that of sensor files, and streams have theirs; name the sensor, too")
     asked = bool(sensors or ppp or bits)
     streams = _streams(clips)
     if sensors and ppp and (bits or all(map(_is_file, sensors))):  # the streams decide nothing
@@ -53,7 +57,7 @@ def choose(
     for sensor in sensors or (None,):
         own = tuple(noise for noise in base if noise.sensor == sensor) or base
         asked_for += [
-            _changed(noise, sensor, level, depth)
+            _changed(noise, sensor, level, depth, temperature)
             for noise in own
             for depth in bits or (None,)
             for level in ppp or (None,)
@@ -85,11 +89,13 @@ def _place(noise: Illumination) -> tuple[object, ...]:
     return noise.sensor, noise.bits or 0, noise.sensing.lux or 0.0, noise.ppp or 0.0, as_text(noise.to_dict())
 
 
-def _changed(noise: Illumination, sensor: str | None, ppp: float | None, bits: int | None) -> Illumination:
+def _changed(
+    noise: Illumination, sensor: str | None, ppp: float | None, bits: int | None, temperature: float | None
+) -> Illumination:
     """Return a noise with the requested changes."""
-    if sensor is not None and (sensor != noise.sensor or _is_file(sensor)):
+    if sensor is not None and (sensor != noise.sensor or _is_file(sensor) or temperature is not None):
         depth = bits if bits is not None or _is_file(sensor) else noise.bits
-        fresh = Illumination.of(sensor, noise.ppp, depth).stated()
+        fresh = Illumination.of(sensor, noise.ppp, depth, temperature=temperature).stated()
         noise = fresh.but(lux=noise.sensing.lux, diffraction=noise.sensing.diffraction)
     if ppp is not None:
         noise = noise.but(ppp=ppp, lux=None)

@@ -11,7 +11,7 @@ import numpy as np
 
 from qsim import records
 from qsim.files import read_json
-from qsim.kinds import Bits, Count, Light, Positive, Seed, Split, Text, Whole
+from qsim.kinds import Bits, Count, Light, Number, Positive, Seed, Split, Text, Whole
 from qsim.settings import setting
 from qsim.words import positive_numbers
 from quiver import threads
@@ -85,6 +85,9 @@ class Settings:
         tuple[Bits, ...] | None,
         setting("bits per code; several: 1,3", unset="the protocol's, else those of the streams"),
     ] = None
+    temperature: Annotated[
+        Number | None, setting("degrees C of sensor files with dark_doubling", unit="degrees C", unset="the files' own")
+    ] = None
     noise: tuple[Illumination, ...] | None = None  # follows from these three, set by `settled`; every window draws one
     crop: Annotated[Whole, setting("px, side of the training windows", unset="the protocol's")] = 64
     frames: Annotated[
@@ -149,7 +152,7 @@ class Settings:
         if self.noise is not None:
             return self.noise
         return tuple(
-            Illumination.of(sensor, ppp, bits)
+            Illumination.of(sensor, ppp, bits, temperature=self.temperature)
             for sensor in self.sensors or ("quiver-physical",)
             for bits in self.bits or (3,)
             for ppp in self.ppp or (3.25,)
@@ -180,7 +183,7 @@ PROTOCOLS: dict[str, dict[str, Any]] = {
     | {"sensor": "quiver-paper", "learning_rate": 2.5e-5, "batch": 4, "loss": "paper", "steps": 94_500},
     "spad-sum": {"sensor": "spad-320x240", "ppp": (4.9,), "bits": (3,)},
 }
-_ASKED = ("sensor", "ppp", "bits")
+_ASKED = ("sensor", "ppp", "bits", "temperature")
 
 
 def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[str]]:
@@ -192,13 +195,14 @@ def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[
     if settings.noise is not None:
         return settings, Mixture(settings.noise).lines
     clips = open_clips(settings.data, "train")
-    mixture = choose(clips, settings.sensors, settings.ppp, settings.bits)
+    mixture = choose(clips, settings.sensors, settings.ppp, settings.bits, settings.temperature)
     path = Path(settings.out) / "settings.json"
     if force or not path.is_file():
         return replace(settings, noise=mixture.noises), mixture.lines
     found = read_json(path)
     try:
-        asked = {name: getattr(settings, name) or _as_tuple(found.get(name)) for name in _ASKED}
+        given = {name: getattr(settings, name) for name in _ASKED}
+        asked = {name: _as_tuple(found.get(name)) if value is None else value for name, value in given.items()}
         noise = _recorded(found)
         told = replace(settings, **asked, noise=noise, threads=settings.threads or threads.recorded(path))
     except (TypeError, ValueError) as error:

@@ -81,6 +81,23 @@ def test_a_sensor_file_brings_its_bits_and_defects(tiny_dataset, tmp_path):
         lines(tiny_dataset, tmp_path / "r", sensor=file, bits=(2,))
 
 
+def test_a_temperature_is_that_of_sensor_files(tiny_dataset, tmp_path):
+    law = "dark_doubling = 8.0\ndark_reference = 25.0\n[defects]"
+    file = sensor_file(tmp_path, QIS.replace("[defects]", law), 3)
+    run = Settings(str(tiny_dataset), str(tmp_path / "r"), steps=1, sensor=file, temperature=49.0)
+    found, lines = settled(run)
+    assert lines == ["noise: mine, 3 bits, 3.25 PPP, temperature 49 (as asked for)"]
+    (noise,) = found.noise
+    (own,) = settled(replace(run, temperature=None))[0].noise
+    assert noise.device(5e-4).dark_rate == pytest.approx(8 * own.device(5e-4).dark_rate)
+    for sensor, message in (
+        (None, "temperature: is that of sensor files"),
+        ("spad512s", "spad512s: has no law of temp"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            settled(replace(run, sensor=sensor))
+
+
 def test_what_windows_cannot_have_is_refused(make_clip: ClipMaker, tmp_path):
     counter = sensor_file(tmp_path, COUNTER + "carry_dead_time = true\n", 3)
     with pytest.raises(ValueError, match=r"carry_dead_time and afterpulse of counting pixels.*without them"):

@@ -48,7 +48,7 @@ def test_lights_of_one_label_get_names_that_tell_them_apart():
     assert named(noise, noise.but(diffraction=True), noise.but(temperature=40.0), replace(noise, defects="{}")) == [
         "10 lx, 3 bit, spad-320x240",
         "10 lx, 3 bit, diffraction",
-        "10 lx, 3 bit, temperature 40.0",
+        "10 lx, 3 bit, temperature 40",
         "10 lx, 3 bit, spad-320x240, defects",
     ]
     with pytest.raises(ValueError, match="two different lights are both called '10 lx, 3 bit, spad-320x240, defects'"):
