@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from qsim.checks import ArgumentError
 from qsim.cli.command import command
@@ -20,12 +20,11 @@ from qsim.kinds import Split
 from qsim.settings import setting
 from quiver.cli.options import handling, use_threads
 from quiver.device import DEVICES
-from quiver.restoration.interface import QUIVERS, RestoreOptions
-from quiver.training.settings import Settings
+from quiver.model.names import QUIVERS
+from quiver.restoration.interface import RestoreOptions
+from quiver.training.settings import PROTOCOLS, Settings
 
 DIVERGED = 3  # exit code of a run whose loss became NaN or infinite
-
-Protocol = Literal["quick", "control", "published", "paper", "spad-sum"]  # see quiver/training/settings.py
 
 # ---- train
 
@@ -34,7 +33,9 @@ Protocol = Literal["quick", "control", "published", "paper", "spad-sum"]  # see 
 class Train:
     """How `quiver train` runs; what it trains are the `Settings`, whose defaults the protocol has."""
 
-    protocol: Annotated[Protocol, setting("bundle of defaults; compared networks have quick and published")] = "quick"
+    protocol: Annotated[
+        str, setting("bundle of defaults; compared networks have quick and published", choices=tuple(PROTOCOLS))
+    ] = "quick"
     device: Annotated[str, setting("device", choices=DEVICES)] = "auto"
     force: Annotated[bool, setting("replace an existing run")] = False
 
@@ -199,7 +200,7 @@ class Ablate:
     data: Annotated[str, setting("data set folder", positional=True)]
     output: Annotated[str, setting("folder of the six runs and their table", short="o")]
     preset: Annotated[str, setting("network", choices=QUIVERS)] = "quiver-s"
-    protocol: Annotated[Protocol, setting("bundle of defaults")] = "quick"
+    protocol: Annotated[str, setting("bundle of defaults", choices=tuple(PROTOCOLS))] = "quick"
     split: Annotated[Split, setting("split to score on")] = "test"
 
 

@@ -16,8 +16,6 @@ from qsim.words import memory_size
 from quiver.data.codes import Codes, light_of
 from quiver.device import DEVICES, HOST_MEMORY, default_memory, pick_device
 from quiver.host import own_numbers
-from quiver.model.names import NETWORKS as NETWORKS
-from quiver.model.names import QUIVERS as QUIVERS
 from quiver.restoration.domain import UP_TO_A_FACTOR, Scope, place_of, remark
 from quiver.restoration.mosaics import by_colour, fill_mosaic
 

@@ -18,7 +18,7 @@ from quiver import threads
 from quiver.data.clips import open_clips
 from quiver.data.illumination import Illumination, sensor_names
 from quiver.data.mixture import Mixture, choose, describe
-from quiver.restoration.interface import NETWORKS
+from quiver.model.names import NETWORKS
 from quiver.restoration.settings import method_names
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.optimiser import Kind
