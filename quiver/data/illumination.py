@@ -34,6 +34,8 @@ DEFAULT = Sensing("quiver-physical", bits=3, ppp=3.25)
 ALWAYS = ("sensor", "bits", "ppp")  # keys of every stored description
 LEVEL = (*ALWAYS, "lux")  # settings that the text of a light states in its own words
 HONOURED = (*LEVEL, "diffraction", "defects", "temperature", "pixel_pitch")
+# Settings of streams that `unlike_windows` knows by what they led to, or that change no law of the codes
+STATED = ("seed", "name", "group", "slices", "row_delay", "row_order", "exposures", "follow")
 OTHERS = "give --sensor, --bits and --ppp, in Python WindowSettings(lights=...)"  # where a stream's noise is of no use
 LONGEST = 500  # characters of a stored name
 
@@ -231,7 +233,7 @@ def unlike_windows(stream: Stream) -> list[str]:
         unlike.append("rows at their own time")
     if stream.shares is not None:
         unlike.append("different exposures")
-    return unlike
+    return unlike + [name for name in stream.info.settings if name not in (*HONOURED, *STATED)]
 
 
 def refuse_others(names: Iterable[str], where: str) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from qsim.streams.preparation import prepare
 from qsim.streams.sensing import Sensing
 from qsim.streams.storing import sense
 from quiver.data.clips import open_clips
-from quiver.data.illumination import HONOURED, Illumination, labels
+from quiver.data.illumination import HONOURED, Illumination, labels, unlike_windows
 from quiver.data.windows import Windows, WindowSettings
 from quiver.model.unet import UNet, UNetConfig
 from quiver.restoration.restorers import restorer
@@ -125,6 +126,8 @@ def test_every_other_setting_is_refused(make_clip: ClipMaker):
         light = Illumination.of(**{name: value} | more)
         with pytest.raises(ValueError, match=f"quiver-physical: a training window has one full .* has .*{name}"):
             Windows([clip], WindowSettings((light,), crop=16))
+    info = SimpleNamespace(planes_per_code=1, settings={"seed": 3, "diffraction": True, "colour": "rggb", "later": 1})
+    assert unlike_windows(SimpleNamespace(info=info, rows=None, shares=None)) == ["colour", "later"]
 
 
 # Runs
