@@ -19,7 +19,7 @@ Made = TypeVar("Made")
 
 def values_of(record: Any) -> dict[str, Any]:
     """Return what the file of a record holds."""
-    return files.sealed({"format_version": FORMAT_VERSION} | _kind(type(record)) | records.plain(record))
+    return sealed({"format_version": FORMAT_VERSION} | _kind(type(record)) | records.plain(record))
 
 
 def write(path: Path, record: Any) -> str:
@@ -40,7 +40,7 @@ def of_values(path: Path, found: dict[str, Any], kind: type[Made], cure: str) ->
         raise ValueError(f"{path}: expected the format {expected['format']}, got {found.get('format')!r:.60}; {cure}")
     values = {key: value for key, value in found.items() if key not in ("format_version", "checksum", *expected)}
     record = records.convert(values, kind, str(path), cure=cure)
-    files.check_own(path, found, cure)
+    _check_own(path, found, cure)
     return record
 
 
@@ -51,4 +51,30 @@ def _kind(kind: Any) -> dict[str, str]:
 
 def check_version(path: Path, found: dict[str, Any]) -> None:
     """Raise `ValueError` with both versions if the contents of a file are of another format version."""
-    files.check_version(path, found.get("format_version"), FORMAT_VERSION)
+    version = found.get("format_version")
+    if version == FORMAT_VERSION:
+        return
+    newer = isinstance(version, int) and version > FORMAT_VERSION
+    advice = "it was made by a newer qsim: update this one" if newer else "make it again with this qsim"
+    raise ValueError(f"{path}: format version {version!r}, this qsim reads version {FORMAT_VERSION}; {advice}")
+
+
+def write_values(path: Path, values: dict[str, Any]) -> str:
+    """Write the contents of a description with their checksum, atomically; return the SHA-256 of the file."""
+    return files.write_json(path, sealed(values))
+
+
+def sealed(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the contents of a description with the checksum of their other keys."""
+    return values | {"checksum": _checksum(values)}
+
+
+def _checksum(values: dict[str, Any]) -> str:
+    """Return the SHA-256 of the contents of a description without its key `checksum`."""
+    return files.sha256(files.to_json({key: value for key, value in values.items() if key != "checksum"}))
+
+
+def _check_own(path: Path, found: dict[str, Any], cure: str) -> None:
+    """Raise `ValueError` unless a description holds the checksum of its other keys."""
+    if found.get("checksum") != _checksum(found):
+        raise ValueError(f"{path}: contents changed (checksum differs); {cure}")

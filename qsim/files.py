@@ -173,27 +173,6 @@ def write_json(path: Path, value: Any) -> str:
     return write_bytes(path, to_json(value))
 
 
-def checksum(description: dict[str, Any]) -> str:
-    """Return the SHA-256 of a description without its key `checksum`."""
-    return sha256(to_json({key: value for key, value in description.items() if key != "checksum"}))
-
-
-def sealed(description: dict[str, Any]) -> dict[str, Any]:
-    """Return the description with the checksum of its other keys, as all descriptions are stored."""
-    return description | {"checksum": checksum(description)}
-
-
-def write_description(path: Path, value: dict[str, Any]) -> str:
-    """Write `value` with its checksum atomically as JSON; return the SHA-256 of the file."""
-    return write_json(path, sealed(value))
-
-
-def check_own(path: Path, description: dict[str, Any], cure: str) -> None:
-    """Raise `ValueError` unless a description holds the checksum of its other keys."""
-    if description.get("checksum") != checksum(description):
-        raise ValueError(f"{path}: contents changed (checksum differs); {cure}")
-
-
 def differs(path: Path, expected: str | None) -> list[str]:
     """Return one message if a file is missing or has another SHA-256; else an empty list."""
     if not path.is_file():
@@ -229,15 +208,6 @@ def read_json(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: not readable as JSON ({error}); the file is damaged, make it again") from None
     return parse_json(path, text)
-
-
-def check_version(path: Path, found: object, known: int) -> None:
-    """Raise `ValueError` with both versions if a file has another format version than this program."""
-    if found == known:
-        return
-    newer = isinstance(found, int) and found > known
-    advice = "it was made by a newer qsim: update this one" if newer else "make it again with this qsim"
-    raise ValueError(f"{path}: format version {found!r}, this qsim reads version {known}; {advice}")
 
 
 def check_ours(folder: Path, names: str) -> None:

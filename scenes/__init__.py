@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from qsim import checks
 from qsim.checks import suggest
+from qsim.kinds import Speed
+from qsim.records import convert
 from qsim.scene import Scene
 from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
 from qsim.scenes import (
@@ -80,10 +81,7 @@ def load(
     to 1000, and for one other than 1 that changes no motion of a .py or .xml scene, unless its camera will move
     `along_path`, on which the speed acts.
     """
-    try:
-        checks.speed(float(speed))
-    except ValueError as error:
-        raise ValueError(f"speed: {error}") from None
+    convert(float(speed), Speed, "speed")
     if name == "":
         raise ValueError("scene '': name a family, a file or a folder; '.' is the present folder")
     if str(name) in FAMILIES:

@@ -19,12 +19,13 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import checks
 from qsim.checks import check_shape
 from qsim.clip.source import Source
 from qsim.file_order import numbered
 from qsim.formats import gaps
 from qsim.formats.recording import ENDIANS, ORDERS, Hints, Recording, check_size, values_recording
+from qsim.kinds import Bits
+from qsim.records import convert
 
 LARGEST_SIDE_FILE = 1 << 20  # bytes of a .cihx
 
@@ -123,7 +124,7 @@ def read_raw(path: Path, hints: Hints) -> Recording:
     assert hints.height is not None
     assert hints.width is not None
     assert hints.bits is not None
-    checks.bits(hints.bits)
+    convert(hints.bits, Bits, f"{path}: bits")
     if hints.order is not None and hints.endian is not None and hints.bits != 8:
         raise ValueError(f"{path}: --order states packed pixels, --endian pixels of whole bytes; leave one of them out")
     layout = _with_gaps(Layout(hints.height, hints.width, hints.bits), hints)

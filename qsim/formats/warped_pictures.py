@@ -28,6 +28,8 @@ from qsim import checks, files
 from qsim.clip.clip_info import ClipInfo
 from qsim.clip.source import Source
 from qsim.clip.writer import ClipWriter
+from qsim.kinds import Frames, Seed
+from qsim.records import convert
 from qsim.scene.image_files import read_grey
 from qsim.scene.textures import noise, pictures_in
 from qsim.streams.clip import Clip
@@ -298,9 +300,9 @@ def main(words: Sequence[str] | None = None) -> int:
     args = parser.parse_args(words)
     try:
         for name in ("clips", "frames", "height", "width"):
-            checks.whole(getattr(args, name))
+            convert(getattr(args, name), Frames, f"--{name}")
         for name in ("seed", "first"):
-            checks.seed(getattr(args, name))
+            convert(getattr(args, name), Seed, f"--{name}")
         if not 0 <= args.motion <= 100:
             raise ValueError(f"--motion: expected 0 to 100 px/frame, got {args.motion!r}")
         made = make(args.output, args.pictures, args.licence, args)

@@ -9,10 +9,11 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from qsim.kinds import Number, Positive, Whole
 from qsim.optics.lens import Lens
 from qsim.optics.zoom import Zoom
 
-Vector = tuple[float, float, float]
+Vector = tuple[Number, Number, Number]
 
 
 @runtime_checkable
@@ -37,11 +38,11 @@ def checked_pitch(pitch: float, where: str) -> float:
 class Camera:
     """Lens, pixels, position and orientation of the camera. With a `zoom`, `at` gives the camera of any time."""
 
-    focal_length: float  # m
-    f_number: float  # focal length / entrance pupil diameter
-    pixel_pitch: float  # m; the height of a pixel, and its width unless `lens` has an aspect
-    height: int  # pixels
-    width: int  # pixels
+    focal_length: Positive  # m
+    f_number: Positive  # focal length / entrance pupil diameter
+    pixel_pitch: Positive  # m; the height of a pixel, and its width unless `lens` has an aspect
+    height: Whole  # pixels
+    width: Whole  # pixels
     transmission: float = 1.0  # of lens and filters, above 0, at most 1
     fill_factor: float = 1.0  # photosensitive share of the pixel, above 0, at most 1
     wavelength: float = 550e-9  # m, effective wavelength of the rendered band
@@ -51,7 +52,7 @@ class Camera:
     up: Vector = (0.0, 1.0, 0.0)
     motion: Pose | None = None  # in the camera's own axes: x right, y down, z forward
     aperture_blur: bool = False  # thin lens of diameter focal_length / f_number instead of a pinhole
-    focus_distance: float | None = None  # m; None: distance from origin to target
+    focus_distance: Positive | None = None  # m; None: distance from origin to target
     lens: Lens | None = field(default=None, metadata={"described": "if any"})  # distortion, fall-off; None: ideal
     zoom: Zoom | None = field(default=None, metadata={"described": "if any"})  # replaces focal_length, lens over time
 

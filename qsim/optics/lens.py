@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.kinds import Number
+
 KNOWN = 4097  # radii whose images are computed; the inverse starts between two of them
 STEPS = 3  # of Newton's method from there; tests/qsim/optics/test_lens.py measures what they leave
 TANGENTIAL_STEPS = 40  # at most, of the damped method for lenses with tangential terms; a usual one needs four
@@ -38,15 +40,15 @@ IF_SET: dict[str, Any] = {"described": "if any"}
 class Lens:
     """Distortion, fall-off and principal point of a lens, and the pixels' shape; the defaults are an ideal lens."""
 
-    k1: float = 0.0  # of the slope squared; below 0 barrel, above 0 pincushion
-    k2: float = 0.0  # of its fourth power
-    falloff: tuple[float, ...] = ()  # a of the share of light 1 + a[0] r^2 + a[1] r^4 + ..., r the slope of the ray
-    shift: tuple[float, float] = (0.0, 0.0)  # of the axis from the middle, right and down, in heights of the picture
-    k3: float = field(default=0.0, metadata=IF_SET)  # of its sixth power
-    k4: float = field(default=0.0, metadata=IF_SET)  # of its eighth power
-    p1: float = field(default=0.0, metadata=IF_SET)  # tangential, downwards
-    p2: float = field(default=0.0, metadata=IF_SET)  # tangential, to the right
-    aspect: float = field(default=1.0, metadata=IF_SET)  # fl_x / fl_y: a pixel's height over its width
+    k1: Number = 0.0  # of the slope squared; below 0 barrel, above 0 pincushion
+    k2: Number = 0.0  # of its fourth power
+    falloff: tuple[Number, ...] = ()  # a of the share of light 1 + a[0] r^2 + a[1] r^4 + ..., r the slope of the ray
+    shift: tuple[Number, Number] = (0.0, 0.0)  # of the axis from the middle, right and down, in heights of the picture
+    k3: Number = field(default=0.0, metadata=IF_SET)  # of its sixth power
+    k4: Number = field(default=0.0, metadata=IF_SET)  # of its eighth power
+    p1: Number = field(default=0.0, metadata=IF_SET)  # tangential, downwards
+    p2: Number = field(default=0.0, metadata=IF_SET)  # tangential, to the right
+    aspect: Number = field(default=1.0, metadata=IF_SET)  # fl_x / fl_y: a pixel's height over its width
 
     def __post_init__(self) -> None:
         numbers = (*self.terms.values(), self.aspect, *self.falloff, *self.shift)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.kinds import Number, Positive
 from qsim.optics.hermite import value_at
 from qsim.optics.lens import Lens
 
@@ -23,8 +24,8 @@ class Zoom:
     Before the first and after the last time the view rests. The f-number stays.
     """
 
-    times: tuple[float, ...]  # s, increasing
-    distances: tuple[float, ...]  # of the pixels from the lens, `Camera.image_distance`, in heights of the picture
+    times: tuple[Number, ...]  # s, increasing
+    distances: tuple[Positive, ...]  # of the pixels from the lens, `Camera.image_distance`, in heights of the picture
     lenses: tuple[Lens, ...]  # all with the same falloff
 
     def __post_init__(self) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import checks
+from qsim.records import convert
 
 
 @dataclass(frozen=True)
@@ -109,10 +109,7 @@ def _turns(flicker: RectifiedSine | PulseWidth, start: Array, stop: Array) -> tu
 def _check(flicker: Flicker) -> None:
     kind = type(flicker).__name__
     for name in ("frequency", "phase"):
-        try:
-            value = checks.real(getattr(flicker, name))
-        except ValueError as error:
-            raise ValueError(f"{kind}.{name}: {error}") from None
+        value = convert(getattr(flicker, name), float, f"{kind}.{name}")
         if not math.isfinite(value) or (name == "frequency" and not 0 < value <= 1e9):
             wanted = "Hz above 0 to 1e9" if name == "frequency" else "finite radians"
             raise ValueError(f"{kind}.{name}: {wanted} expected, got {value!r}")

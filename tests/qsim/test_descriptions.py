@@ -15,7 +15,7 @@ import pytest
 from clips import write_clip
 from mutations import at, places, replaced
 
-from qsim import files
+from qsim import descriptions, files
 from qsim.cli.program import main
 from qsim.dataset import checking, generation, recipe
 from qsim.dataset.dataset import Dataset
@@ -193,7 +193,7 @@ def hostile_descriptions(made: Path, folder: Path, wanted: int | None, *uses: Ca
         if value == "GONE":
             inside = at(found, place[:-1])
             inside.pop(place[-1])
-        files.write_description(path, found)
+        descriptions.write_values(path, found)
         for use in (
             *uses,
             lambda folder: [checking.check(folder / name) for name in ("clip", "data", "capture.npy", "video.npy")],

@@ -88,7 +88,7 @@ MISTAKES = [
     ("quiver domain mergenet lit --seed -1", "--seed: expected a whole number from 0 to 2147483647, got '-1'"),
     ("qsim render fan -o x --speed nan", "--speed: expected a number from 0.001 to 1000, got 'nan'"),
     ("qsim render fan -o x --speed 1e300", "--speed: expected a number from 0.001 to 1000, got '1e300'"),
-    ("qsim tradeoff fan -o x --speed 1e300", "speed: expected a factor on all motions from 0.001 to 1000, got 1e+300"),
+    ("qsim tradeoff fan -o x --speed 1e300", "speed: expected a number from 0.001 to 1000, got 1e+300"),
     ("qsim render fan -o x --bands cmyk", "--bands: expected one of rgb, got 'cmyk'"),
     ("qsim render fan -o x --camera-path none.json", "none.json: no such file"),
     ("qsim render fan -o x --camera-path text.txt", "text.txt: not readable as JSON"),

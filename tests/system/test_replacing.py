@@ -12,7 +12,7 @@ import pytest
 from clips import write_clip
 
 import quiver.cli.program
-from qsim import files
+from qsim import descriptions, files
 from qsim.cli.program import main
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset
@@ -50,7 +50,7 @@ def rewritten(path: Path, change: Callable[[dict], object]) -> None:
     """A description with a change and the right checksum, as an attacker writes it."""
     found = files.read_json(path)
     change(found)
-    files.write_description(path, found)
+    descriptions.write_values(path, found)
 
 
 @pytest.mark.parametrize("name", HOSTILE, ids=lambda name: repr(name)[:12])

@@ -206,7 +206,7 @@ def test_loading_by_name_and_by_file(tmp_path):
         scenes.load("fun")
     with pytest.raises(ValueError, match=r"scene '': name a family, a file or a folder; '\.' is the present folder"):
         scenes.load("")
-    with pytest.raises(ValueError, match=r"speed: expected a factor on all motions from 0\.001 to 1000, got 1000\.1"):
+    with pytest.raises(ValueError, match=r"speed: expected a number from 0\.001 to 1000, got 1000\.1"):
         scenes.load("fan", speed=1000.1)
     with pytest.raises(FileNotFoundError, match=r"missing.py: no such file"):
         scenes.load(tmp_path / "missing.py")

@@ -37,7 +37,7 @@ from machines import ErrorsOfLight, Fits, Rendered, Sums
 import qsim.cli
 import quiver.cli
 from qsim import QIS, BinarySPAD, Camera, Clip, ClipWriter, CountingSPAD, Dataset, Key, Sensor
-from qsim.files import write_description
+from qsim.descriptions import write_values
 from quiver import restore
 
 DATA = Path(__file__).parents[1] / "data"
@@ -125,7 +125,7 @@ def write_dataset(path: Path) -> Path:
         (path / "jobs").mkdir(exist_ok=True)
         (path / "jobs" / f"moving_{seed}.json").write_text(json.dumps(record))
     about = {"format_version": 1, "name": "moving", "jobs": jobs}
-    write_description(path / "dataset.json", about)
+    write_values(path / "dataset.json", about)
     return path
 
 

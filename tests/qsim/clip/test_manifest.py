@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tiny_clip import meta, write
 
-from qsim import files
+from qsim import descriptions, files
 from qsim.clip.writer import ClipWriter
 from qsim.formats.exporting import camera_file
 from qsim.optics.camera import Camera
@@ -108,6 +108,6 @@ def test_a_damaged_lens_is_named(tmp_path: Path):
     for damage in ({"k1": "x"}, {"falloff": 3}, {"shift": [1.0]}, {"falloff": [None]}, {"k5": 0.1}, {"k1": -1e9}):
         about = files.read_json(clip.path / "clip.json")
         about["camera"]["lens"] = good | damage
-        files.write_description(clip.path / "clip.json", about)
+        descriptions.write_values(clip.path / "clip.json", about)
         with pytest.raises(ValueError, match=r"clip\.json: .*camera.*lens"):
             assert Clip.open(clip.path).camera

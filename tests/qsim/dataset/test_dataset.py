@@ -12,7 +12,7 @@ from fakes import (
     tree,
 )
 
-from qsim import files
+from qsim import descriptions, files
 from qsim.dataset.checking import check
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import generate
@@ -85,7 +85,7 @@ def test_what_training_sees_of_the_test_split_is_reported(tmp_path: Path, asset:
     generate(SMALL, tmp_path / "d", HERE, make=make)
     for name, assets in [("fan_0001", [asset, "mesh m"]), ("tumble_0004", ["mesh n", asset])]:
         path = tmp_path / "d" / "clips" / name / "clip.json"
-        files.write_description(path, files.read_json(path) | {"assets": assets})
+        descriptions.write_values(path, files.read_json(path) | {"assets": assets})
     shared = generate(SMALL, tmp_path / "d", HERE, make=make).shared
     assert len(shared) == 1
     assert f"its {asset} is also in fan_0001, which is not a test clip" in shared[0]
@@ -108,7 +108,7 @@ def test_files_that_scenes_of_both_kinds_read_are_reported_by_name(tmp_path: Pat
             "LICENCE.txt": "4" * 64,
             f"{name}.hdr": files.sha256(name.encode()),
         }
-        files.write_description(path, files.read_json(path) | {"assets": [f"photograph {TWO}"], "reads": reads})
+        descriptions.write_values(path, files.read_json(path) | {"assets": [f"photograph {TWO}"], "reads": reads})
     shared = generate(SMALL, folder, HERE, make=make).shared
     clip = folder / "clips" / "tumble_0004"
     named = (f"b.png (SHA-256 {TWO})", f"/mine/HARE.OBJ (SHA-256 {ONE})")

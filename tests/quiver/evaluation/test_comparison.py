@@ -14,7 +14,7 @@ from methods import broken, method
 from numpy import ndarray as Array
 from sensor_files import QIS, sensor_file
 
-from qsim import files
+from qsim import descriptions, files
 from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.optics.radiometry import RGB
@@ -203,7 +203,7 @@ def test_an_evaluation_of_other_codes_or_another_truth_is_not_continued(make_cli
     else:
         description = clip.path / "clip.json"
         meta = json.loads(description.read_text()) | {"scene": {"family": "sliding", "seed": 9}}
-        files.write_description(description, meta)
+        descriptions.write_values(description, meta)
     with pytest.raises((FileExistsError, ValueError), match="changed since"):
         evaluate(comparison, methods, tmp_path / "t")
     assert (tmp_path / "t" / "rows.jsonl").read_bytes() == before
