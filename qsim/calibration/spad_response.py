@@ -161,8 +161,11 @@ class Response:
     def _of_counts(self, stack: FrameStatistics) -> Arrivals:
         t = stack.frames
         mean = stack.total / t
-        arrivals, codes = self.table(float(mean.max()))
-        found = np.interp(mean, codes, arrivals)
+        even = mean  # the code that an evenly lit array of this pixel's light would have
+        if self.crosstalk:
+            even = np.maximum(mean - self.crosstalk * (over_neighbours(mean) - NEIGHBOURS * mean), 0.0)
+        arrivals, codes = self.table(float(even.max()))
+        found = np.interp(even, codes, arrivals)
         slope_table = np.gradient(codes, arrivals)
         at = np.interp(stack.mean, codes, arrivals)
         variance = np.where(stack.pixel_variance > 0, stack.pixel_variance, 0.0) if t > 1 else mean
@@ -170,8 +173,6 @@ class Response:
         slopes = np.maximum(np.interp(found, arrivals, slope_table), _LEAST_ROOM)
         curvature = np.interp(found, arrivals, np.gradient(slope_table, arrivals))
         found = found + 0.5 * curvature / slopes**3 * variance
-        if self.crosstalk:
-            found = found - self.crosstalk * (over_neighbours(mean) - NEIGHBOURS * mean)
         return Arrivals(found, variance / slopes**2, float(np.interp(at, arrivals, slope_table)))
 
     def _counter(self, bits: int) -> CountingSPAD:
