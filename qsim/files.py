@@ -33,6 +33,24 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")  # of clips and streams: a safe
 FULL = (errno.ENOSPC, errno.EDQUOT)  # of an `OSError`: no space left
 
 
+class Blocked(FileExistsError):
+    """The place of an output is taken: `problem` says by what, and `cure` what to do, which a command may replace."""
+
+    def __init__(self, problem: str, cure: str) -> None:
+        super().__init__(f"{problem}; {cure}")
+        self.problem = problem
+        self.cure = cure
+
+
+class Damaged(ValueError):
+    """A file of our own cannot be read: `problem` says why, and `cure` what to do, which a command may replace."""
+
+    def __init__(self, problem: str, cure: str) -> None:
+        super().__init__(f"{problem}; {cure}")
+        self.problem = problem
+        self.cure = cure
+
+
 def _version() -> str:
     """Return the version of the installed package, or of a source tree without installation."""
     try:

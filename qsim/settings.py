@@ -108,10 +108,11 @@ class Setting:
     @property
     def help_with_default(self) -> str:
         """The line of help with its default, as in `bits per code (default: the sensor's own)`."""
+        words = f"{self.help} [{self.unit}]" if self.unit else self.help
         if not self.default_words:
-            return self.help
+            return words
         mark = ": " if self.unset else " "
-        return f"{self.help} (default{mark}{self.default_words})"
+        return f"{words} (default{mark}{self.default_words})"
 
 
 def settings_of(kind: Any) -> tuple[Setting, ...]:

@@ -27,7 +27,7 @@ def pick_device(wanted: str) -> str:
     if wanted not in DEVICES:
         raise ValueError(f"device {wanted!r}; known are {', '.join(DEVICES)}")
     if wanted == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: torch finds no CUDA device here; use --device cpu")
+        raise ValueError("device=cuda: torch finds no CUDA device here; use device=cpu")
     return wanted
 
 

@@ -83,7 +83,7 @@ def recorded(path: Path) -> int | None:
 def check(wanted: int | None) -> None:
     """Raise `ValueError` unless the machine has this many cores; None is allowed."""
     if wanted is not None and not 1 <= wanted <= cores():
-        raise ValueError(f"--threads {wanted}: this machine has {cores()} cores; give 1 to {cores()}")
+        raise ValueError(f"threads={wanted}: this machine has {cores()} cores; give 1 to {cores()}")
 
 
 @cache

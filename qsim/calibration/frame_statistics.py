@@ -225,7 +225,7 @@ def _as_values(block: Array, top: int, what: str, name: str, frame: int) -> Arra
         t, y, x = (int(i) for i in np.argwhere(wrong)[0])
         cure = ""
         if top == 1 and block[t, y, x] > 1:
-            cure = "; sums of N binary planes are calibrated with --planes N"
+            cure = "; sums of N binary planes are calibrated with planes=N"
         raise ValueError(
             f"{name}: {block[t, y, x]} at (t, y, x) = ({frame + t}, {y}, {x}) is not a {what}, 0..{top}{cure}"
         )

@@ -102,7 +102,7 @@ def _check(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], b
     if bits < 2:
         raise ValueError(
             "calibrate: 1 bit per code cannot tell gain, offset and read noise apart; calibrate binary planes with "
-            "--model spad (calibrate_spad)"
+            "model=spad (calibrate_spad)"
         )
     if not darks or not flats:
         missing = "dark" if not darks else "flat"
@@ -122,7 +122,7 @@ def _check(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], b
         )
     dark = min(stack.mean for stack in darks)
     if all(flat.mean <= dark for flat in flats):
-        raise ValueError("calibrate: no flat is brighter than the dark frames; are --dark and --flat swapped?")
+        raise ValueError("calibrate: no flat is brighter than the dark frames; are dark and flat frames swapped?")
 
 
 def _with_intervals(

@@ -79,7 +79,7 @@ def odd_efficiency(found: Value) -> list[str]:
     """Return a warning if an efficiency is significantly above 1, which no sensor file holds; `ValueError` if 0."""
     if found.value <= 0:
         raise ValueError(
-            "calibrate: the flats of known light hold no more counts than the dark frames; are --dark and --flat "
+            "calibrate: the flats of known light hold no more counts than the dark frames; are dark and flat frames "
             "swapped, or are the flats without light?"
         )
     if found.low <= 1:

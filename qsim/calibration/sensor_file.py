@@ -66,7 +66,7 @@ def _blocks(path: Path, bits: int, exposure: float, planes: int | None, hints: H
     if stream is not None:
         if hints.width not in (None, stream.shape[2]):
             raise ValueError(
-                f"{path}: is a stream of {stream.shape[2]} pixels per row, not {hints.width}; leave --width out"
+                f"{path}: is a stream of {stream.shape[2]} pixels per row, not {hints.width}; leave width= out"
             )
         return _array_blocks(read_counts(path, replace(hints, width=None), bits, exposure * (planes or 1)))
     bare = hints == Hints(variable=hints.variable)
@@ -121,7 +121,7 @@ def read_counts(
     if path.suffix == ".mat" and bare:
         return mat_array(path, hints.variable)
     if hints.variable is not None and not path.is_dir():
-        raise ValueError(f"{path}: --variable names an array of a .mat file; leave it out")
+        raise ValueError(f"{path}: variable= names an array of a .mat file; leave it out")
     stream = stream_of(path)
     if stream is not None:
         if bits not in (None, stream.bits):
@@ -129,7 +129,7 @@ def read_counts(
         if exposure is not None and not math.isclose(exposure, stream.exposure, rel_tol=1e-3):  # typed by hand
             raise ValueError(
                 f"{path}: is a stream of codes of {stream.exposure:g} s, not of {exposure:g} s; give what it states, "
-                "or convert it again with the true --exposure"
+                "or convert it again with the true exposure="
             )
         if not bare:
             raise ValueError(f"{path}: is a stream, which states its layout; leave the options of raw files out")
@@ -197,7 +197,7 @@ def to_toml(found: Calibration, title: str, stem: str = "") -> str:
         lines += ["", "# [defects]  # uncomment to give every pixel its own dark counts"]
         lines += [f'# dark_map = "{stem}{_DARK_MAP}"']
         hot = int(found.maps["hot_pixels"].sum())
-        lines += [f"# hot pixels: {hot}, true in {stem}{_HOT_MAP}, as in quiver restore --defects {stem}{_HOT_MAP}"]
+        lines += [f"# hot pixels: {hot}, true in {stem}{_HOT_MAP}, as in `quiver restore`, defects={stem}{_HOT_MAP}"]
     return "\n".join(lines) + "\n"
 
 

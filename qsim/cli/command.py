@@ -19,6 +19,7 @@ from qsim.checks import ArgumentError
 from qsim.cli.setting_options import parameter_of, record_of, records_of
 from qsim.settings import Setting, setting, settings_of
 
+_ARGUMENT = re.compile(r"(?P<call>\b\w+\([^()]*\))|\b(?P<name>[a-z_]+)=(?P<value>'[^']*'|[^\s,;:)`]*)")
 STARTS_AGAIN = "no incomplete file is left; run the same command again"
 
 
@@ -54,15 +55,29 @@ class Command:
         """All settings, those of every command last."""
         return (*self.own, *settings_of(Printing))
 
-    def in_options(self, error: BaseException, text: str) -> str:
+    @property
+    def options(self) -> dict[str, str]:
+        """The options by the names of their arguments."""
+        return {one.name: f"--{one.option}" for one in self.settings if not one.positional}
+
+    def in_options(self, error: BaseException, text: str, others: Callable[[], Mapping[str, str]]) -> str:
         """Return the text of an error of the library with the options of this command in place of arguments.
 
-        The library writes `ppp=` for an argument, and `force=True` for a flag; an `ArgumentError` begins with its name.
+        The library writes `ppp=` or `ppp=3.25` for an argument, and `force=True` for a flag; an `ArgumentError` begins
+        with the name of its argument. `others` are the options of other commands, which a cure may name.
         """
-        options = {one.name: f"--{one.option}" for one in self.settings if not one.positional}
+        options = self.options
         if isinstance(error, ArgumentError):
             text = f"{options.get(error.argument, error.argument)}: {error.problem}"
-        return re.sub(r"\b([a-z_]+)=(True)?(?![\w.=])", lambda found: options.get(found[1], found[0]), text)
+
+        def option(found: re.Match[str]) -> str:
+            name = options.get(found["name"]) or (None if found["call"] else others().get(found["name"]))
+            if found["call"] is not None or name is None:
+                return found[0]  # a call, or an argument of a function alone
+            value = "" if found["value"] == "True" else found["value"]
+            return f"{name} {value}".rstrip()
+
+        return _ARGUMENT.sub(option, text)
 
     def arguments(self, values: Mapping[str, Any]) -> list[Any]:
         """Return what the function takes; `ArgumentError` for a setting that is given and cannot act."""

@@ -139,7 +139,9 @@ def _answered(program: Program, command: Command, values: Mapping[str, Any], sta
             raise
         if os.environ.get("QSIM_DEBUG") or state.printing.verbose:
             print(printable(traceback.format_exc()), end="", file=sys.stderr)
-        return failed(f"{program.name}: {command.in_options(error, one_line(error))}", 2, state.printing.json)
+        return failed(
+            f"{program.name}: {command.in_options(error, one_line(error), program.options)}", 2, state.printing.json
+        )
     except KeyboardInterrupt:
         return failed(f"\n{program.name}: interrupted; {_then(state)}", 130, state.printing.json)
     finally:
@@ -240,7 +242,7 @@ def refuse_existing(path: Path, force: bool) -> None:
     if path.is_dir():
         raise FileExistsError(f"{path}: is a folder; name a file with -o")
     if path.exists() and not force:
-        raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
+        raise FileExistsError(f"{path}: exists; name another, or replace it with --force")
     folder = next(parent for parent in path.parents if parent.exists())
     if not folder.is_dir():
         raise NotADirectoryError(f"{folder}: is a file where a folder is needed; name another with -o")

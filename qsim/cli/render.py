@@ -7,20 +7,21 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from qsim import records
 from qsim.backend import BACKENDS
 from qsim.cli.command import Idle, command
 from qsim.cli.completion import families
 from qsim.cli.console import PILOT, RESUMES, bar, output
-from qsim.kinds import FrameRate, Frames, Positive, Psnr, Seed, Shutter, Speed
+from qsim.kinds import Positive, Seed, Speed
+from qsim.rendering.render_settings import RenderSettings
 from qsim.settings import setting
 
 
 @dataclass(frozen=True)
 class Render:
-    """The clip that `qsim render` makes."""
+    """The scene that `qsim render` renders, and where its clip goes; how it is rendered are the `RenderSettings`."""
 
     scene: Annotated[
         str,
@@ -34,33 +35,11 @@ class Render:
     explain: Annotated[bool, setting("print the modelled effects, and the size of the omitted ones")] = False
     seed: Annotated[Seed, setting("seed of the scene and its samples")] = 0
     speed: Annotated[Speed, setting("factor on all motions")] = 1.0
-    frames: Annotated[Frames, setting("number of frames")] = 21
-    height: Annotated[Frames | None, setting("pixels", unset="128; of a Mitsuba file its film's")] = None
-    width: Annotated[Frames | None, setting("pixels", unset="128; of a Mitsuba file its film's")] = None
-    frame_rate: Annotated[FrameRate, setting("frames per second")] = 2000.0
-    shutter: Annotated[Shutter, setting("open fraction of a frame, 0..1", unset="0: sharp")] = 0.0
-    psnr: Annotated[Psnr, setting("requested error of the radiance, in dB below white and clamped at white")] = 40.0
-    bands: Annotated[Literal["rgb"] | None, setting("rgb: in colour, three bands", unset="one band")] = None
-    camera_path: Annotated[
-        Path | None,
-        setting(
-            "transforms.json whose poses, view and distortion the camera has",
-            unset="the camera of the scene",
-            shown="FILE",
-        ),
-    ] = None
     ppp: Annotated[
         Positive | None,
         setting(
             "highest light level you will sense, photons per pixel; sets samples so that the Monte-Carlo variance "
             "stays below 1 % of the shot variance"
-        ),
-    ] = None
-    reuse: Annotated[
-        bool | None,
-        setting(
-            "let sharp frames share samples with their neighbours, or render each frame alone",
-            unset="share where that costs less, and trying it costs little against the clip",
         ),
     ] = None
     engine: Annotated[str | None, setting("engine to use", unset="QSIM_ENGINE, else the fastest", choices=BACKENDS)] = (
@@ -74,9 +53,9 @@ class Render:
     "qsim render fan --explain",
     after_interrupt=RESUMES,
     threads="threads of the renderer (Dr.Jit); the picture does not depend on it",
-    idle=[Idle(lambda asked: "" if asked.output else "replaces the clip of --output", ("force",))],
+    idle=[Idle(lambda asked, _: "" if asked.output else "replaces the clip of --output", ("force",))],
 )
-def render(asked: Render) -> int:
+def render(asked: Render, settings: RenderSettings) -> int:
     """Render the clip and print its error, or explain the samples that it takes."""
     from qsim import backend, scenes
     from qsim.clip.clamped_error import stated
@@ -92,14 +71,18 @@ def render(asked: Render) -> int:
     if asked.output is None and not asked.explain:
         raise ValueError("-o/--output is required (optional only with --explain)")
     if asked.output is not None and asked.output.exists() and not asked.force:
-        raise FileExistsError(f"{asked.output}: exists; name another with -o, or use --force to replace it")
+        raise FileExistsError(f"{asked.output}: exists; name another, or replace it with --force")
     if asked.engine is not None:
         os.environ["QSIM_ENGINE"] = asked.engine
         backend.choose()
-    taken = {name: getattr(asked, name) for name in ("frames", "seed", "frame_rate", "shutter", "psnr", "ppp", "reuse")}
-    size = {name: getattr(asked, name) for name in ("height", "width", "speed", "bands", "camera_path")}
+    taken = {"seed": asked.seed, "ppp": asked.ppp} | {
+        name: getattr(settings, name) for name in ("frames", "frame_rate", "shutter", "psnr", "reuse")
+    }
+    size = {"speed": asked.speed} | {
+        name: getattr(settings, name) for name in ("height", "width", "bands", "camera_path")
+    }
     if asked.output is None:
-        scene, _ = scene_rendering.load_scene(asked.scene, **size, seed=asked.seed, frame_rate=asked.frame_rate)
+        scene, _ = scene_rendering.load_scene(asked.scene, **size, seed=asked.seed, frame_rate=settings.frame_rate)
         chosen = choose_budget(scene, **taken)
         output({"render": dataclasses.asdict(chosen)}, explain(chosen.findings))
         return 0
@@ -115,7 +98,7 @@ def render(asked: Render) -> int:
     if asked.scene.endswith(GLTF_SUFFIXES):
         text += f"\n{played(scenes.load(asked.scene, asked.seed, asked.speed))}"
     text += "" if found is None else f"\nerror: {found.line}"
-    text += (missed := shortfall(found, asked.psnr)) and f"\nerror: {missed}"
+    text += (missed := shortfall(found, settings.psnr)) and f"\nerror: {missed}"
     if info.fireflies_per_frame:
         fireflies = sum(info.fireflies_per_frame)
         pixels = math.prod(clip.shape)
@@ -128,7 +111,7 @@ def render(asked: Render) -> int:
             if info.saturated_pixels is not None
             else ": cut off there"
         )
-    if not asked.explain and (asked.reuse or work.neighbours):
+    if not asked.explain and (settings.reuse or work.neighbours):
         text += "".join(f"\n{explain([one])}" for one in work.findings if one.effect == REUSE)
     if asked.explain or clip.camera is None:
         text += "\n" + explain(work.findings)

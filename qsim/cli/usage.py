@@ -72,6 +72,10 @@ class Program:
         found: Command = self.app[name].default_command.declared  # type: ignore[union-attr]
         return found
 
+    def options(self) -> dict[str, str]:
+        """Return the options of all commands by the names of their arguments; their modules are imported."""
+        return {name: option for one in self.commands for name, option in self.declared(one).options.items()}
+
     def help(self, name: str = "") -> str:
         """Return the help of the program, or of one of its commands."""
         if not name:

@@ -51,22 +51,20 @@ def target_of(path: str | os.PathLike[str], force: bool) -> Path:
     if found.is_symlink():
         found = found.resolve()
     if found.exists() and not force:
-        raise FileExistsError(f"{found}: exists; name another with -o, or use --force to replace it")
+        raise FileExistsError(f"{found}: exists; name another, or replace it with force=True")
     check_replaced(found)
     above = next(parent for parent in found.absolute().parents if parent.exists())
     if not above.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(found))
     if not os.access(above, os.W_OK | os.X_OK):
-        raise PermissionError(f"{found}: no permission to write into {above}; name another with -o")
+        raise PermissionError(f"{found}: no permission to write into {above}; name another")
     return found
 
 
 def check_replaced(path: Path) -> None:
     """Raise `FileExistsError` if something else than a clip, or a clip with other files in it, would be replaced."""
     if path.exists() and not (path / "clip.json").is_file():
-        raise FileExistsError(
-            f"{path}: exists and is not a clip, which is all that --force replaces; name another with -o"
-        )
+        raise FileExistsError(f"{path}: exists and is not a clip, which is all that is replaced; name another")
     if path.exists():
         files.check_ours(path, OURS)
 

@@ -72,7 +72,7 @@ class ClipWriter:
         self._refuse_foreign()
         self.part.mkdir(parents=True, exist_ok=True)
         if not self._lock.acquire():
-            raise ValueError(f"{self.part}: another process is writing this clip; wait for it, or name another with -o")
+            raise ValueError(f"{self.part}: another process is writing this clip; wait for it, or name another")
         try:
             files.check_ours(self.part, rf"{OURS}|begun\.json|journal\.jsonl|lock")
             begun = self.part / "begun.json"
@@ -85,7 +85,7 @@ class ClipWriter:
                 if done and not self.force:
                     raise ValueError(
                         f"{self.part}: {done} frames exist, begun with other settings, or another scene; "
-                        "repeat those to resume, name another with -o, or use --force to start again"
+                        "repeat those to resume, name another, or start again with force=True"
                     )
                 self._clear()
                 self._complete = False
@@ -209,7 +209,7 @@ class ClipWriter:
 
     def _refuse_foreign(self) -> None:
         """Raise `ValueError` unless .part is free, or what a writer of a clip of this name left there."""
-        foreign = ValueError(f"{self.part}: was not written by qsim; move it away, or name another with -o")
+        foreign = ValueError(f"{self.part}: was not written by qsim; move it away, or name another")
         if not self.part.exists() and not self.part.is_symlink():
             return
         if self.part.is_symlink() or not self.part.is_dir():

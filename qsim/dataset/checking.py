@@ -136,8 +136,8 @@ def _redrawn(place: Path, json_path: Path, dataset: Path | None) -> Redrawn:
 def _cure(dataset: Path | None) -> str:
     """Return what to do about wrong codes, so that `check` passes afterwards."""
     if dataset is None:
-        return "sense it again with --force"
-    return f"delete the file and run `qsim generate RECIPE -o {dataset} --repair`"
+        return "sense it again and replace it"
+    return f"delete the file, and `qsim generate` of {dataset} makes it again with repair=True"
 
 
 def _streams(path: Path) -> list[tuple[Path, Path, Path | None]]:
@@ -198,7 +198,7 @@ def repair_jobs(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
         clip = folder / "clips" / damage.job.name
         if clip.is_symlink() and not damage.light:
             raise ValueError(
-                f"{damage.problems[0]}; {clip} is a symbolic link to {os.readlink(clip)}, and --repair replaces no "
+                f"{damage.problems[0]}; {clip} is a symbolic link to {os.readlink(clip)}, and repair=True replaces no "
                 "links: move the folder back, or delete the link to have the clip made here"
             )
         if clip.is_dir() and not damage.light:

@@ -164,7 +164,7 @@ class Forecast:
             f"{self.processor_hours:.3g} hours of processor time), {self.gigabytes:.3g} GB, "
             f"{self.peak_memory:.2g} GiB of memory per worker",
             f"{_machines(machines)} like this: {each:.3g} hours{' each' if machines > 1 else ''}"
-            + (", by --shard or --cluster" if machines > 1 else "")
+            + (", by shards or a cluster" if machines > 1 else "")
             + idle,
             f"within a day: {_machines(day)} like this{faster}"
             + ("" if on_gpu(self.engine) else "; run this command on a machine with a GPU to have that measured"),

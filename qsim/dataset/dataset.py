@@ -52,7 +52,7 @@ class Dataset:
         """Open a data set; `FileNotFoundError` or `ValueError` if the folder is not one of this version."""
         path = file_path(path)
         manifest = path / "dataset.json"
-        remedy = f"`qsim generate RECIPE -o {path} --repair` writes it again"
+        remedy = f"`qsim generate` of {path} writes it again with repair=True"
         if not manifest.is_file():
             if (path / "jobs").is_dir():
                 raise FileNotFoundError(f"{manifest}: missing; {remedy}")

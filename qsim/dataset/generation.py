@@ -130,7 +130,7 @@ def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:
         return list(jobs)
     i, n = part
     if not 1 <= i <= n:
-        raise ValueError(f"shard {i}/{n}: expected i/n with 1 <= i <= n, as in --shard 7/100")
+        raise ValueError(f"shard {i}/{n}: expected i/n with 1 <= i <= n, as in 7/100")
     return list(jobs[i - 1 :: n])
 
 
@@ -240,8 +240,8 @@ def _check_records(recipe: Recipe, folder: Path, repair: bool) -> None:
     other = [job.name for job in asked if digests[job.name] != job.digest]
     if other and not repair:
         raise ValueError(
-            f"{folder}: its clip {other[0]} was made with other settings; use another folder, or --repair to make it "
-            "again"
+            f"{folder}: its clip {other[0]} was made with other settings; use another folder, or make it "
+            "again with repair=True"
         )
 
 
@@ -259,7 +259,7 @@ def _locked(folder: Path, options: Options) -> Iterator[None]:
     try:
         for lock in held:
             if not lock.acquire(wait=options.wait):
-                raise ValueError(f"{folder}: another generator is at work here; let it finish, or add --wait")
+                raise ValueError(f"{folder}: another generator is at work here; let it finish, or wait with wait=True")
         yield
     finally:
         for lock in held:
@@ -285,7 +285,7 @@ def _failures(folder: Path, jobs: Sequence[Job]) -> dict[str, str]:
             path.unlink(missing_ok=True)
         elif path.is_file():
             try:
-                note = descriptions.read(path, Failure, "add --retry")
+                note = descriptions.read(path, Failure, "add retry=True")
                 if note.digest == job.digest:
                     found[job.name] = note.error
             except ValueError as error:

@@ -15,7 +15,7 @@ from qsim.dataset.job import Job
 from qsim.kinds import Digest, Name, Split, Text
 from qsim.streams.clip import Clip
 
-CURE = "`qsim generate RECIPE -o FOLDER --repair` makes it again"
+CURE = "`qsim generate` makes it again with repair=True"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -116,7 +116,7 @@ class _Worker:
         """Return why the process ended."""
         code = self.process.exitcode
         if code == MEMORY_EXIT:
-            return "it needed more memory than --memory allows"
+            return "it needed more memory than is allowed"
         if code is not None and code < 0:
             return f"signal {signal.Signals(-code).name}; SIGKILL is often a lack of memory"
         return f"exit code {code}"

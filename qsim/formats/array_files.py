@@ -66,7 +66,7 @@ def read_cube(path: Path, hints: Hints) -> Recording:
     description = "meta.json" if array.ndim == 4 else f"{path.name}.json"
     if array.ndim == 4:
         if hints.channel is None or not 0 <= hints.channel < array.shape[3]:
-            raise ValueError(f"{path}: a colour cube of {array.shape[3]} channels; choose one with --channel 0")
+            raise ValueError(f"{path}: a colour cube of {array.shape[3]} channels; choose one with channel=0")
         array = array[..., hints.channel]
     if array.dtype != np.uint8 or array.ndim != 3:
         raise ValueError(f"{path}: a photon cube is uint8 [T, H, bytes], found {array.dtype} {list(array.shape)}")
@@ -129,11 +129,11 @@ def codes_of(
     """Return an array as codes of one bit (bool) or of the stated bits; its axes by --axes, else as `stated`."""
     reading = axes.named(path, values.shape, hints, stated)
     if reading.colour:
-        raise ValueError(f"{path}: colours hold no codes; name the axis of channels C, and choose one with --channel")
+        raise ValueError(f"{path}: colours hold no codes; name the axis of channels C, and choose one with channel=")
     shape = check_shape(path, reading.shape(values.shape))
     bits = 1 if values.dtype == bool else bits or hints.bits
     if bits is None or values.dtype.kind not in "bui":
-        raise ValueError(f"{path}: {values.dtype} codes need a number of bits, as in --bits 3")
+        raise ValueError(f"{path}: {values.dtype} codes need a number of bits, as in bits=3")
 
     def read(start: int, stop: int) -> Array:
         return checked_codes(path, reading.turned(np.asarray(values.read(reading.block(start, stop)))), bits, start)
@@ -149,7 +149,7 @@ def light_of(path: Path, values: Values, form: str, hints: Hints) -> Recording:
         raise ValueError(f"{path}: axis S has {full_shape[3]} colours; red, green and blue are read")
     shape = check_shape(path, full_shape[:3])
     if values.dtype == bool:
-        raise ValueError(f"{path}: bool values are codes of one bit, not light; leave --layout out")
+        raise ValueError(f"{path}: bool values are codes of one bit, not light; leave layout= out")
     floats = values.dtype.kind == "f"
     transfer = "linear" if floats and hints.transfer is None else need_transfer(path, hints)
     top = 1.0 if floats else float(np.iinfo(values.dtype).max)
@@ -259,7 +259,7 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     first = load_array(shards[0])
     channels = first.shape[3] if first.ndim == 4 else 1
     if channels > 1 and hints.channel is None:
-        raise ValueError(f"{path}: {channels} colour planes; choose one with --channel 0")
+        raise ValueError(f"{path}: {channels} colour planes; choose one with channel=0")
     columns = -(-width // 8) if packed else width
     parts = [_shard(shard, channel, channels, columns, width) for shard in shards]
     if packed:
@@ -305,7 +305,7 @@ def _bits_of_sums(path: Path, planes: int, bits: int | None) -> int:
     if not 1 <= found <= 16:
         raise ValueError(f"{path}: sums of {planes!r:.40} bitplanes; read are 1 to 65535")
     if bits is not None and bits != found:
-        raise ValueError(f"{path}: sums of {planes} bitplanes have {found} bits, not {bits}; leave --bits out")
+        raise ValueError(f"{path}: sums of {planes} bitplanes have {found} bits, not {bits}; leave bits= out")
     return found
 
 

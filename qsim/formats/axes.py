@@ -62,12 +62,12 @@ def named(path: Path, sizes: tuple[int, ...], hints: Hints, stated: str | None =
     axes = unasked if given is None else _checked(path, given, sizes)
     if axes is None:
         raise ValueError(
-            f"{path}: expected frames [T, H, W], found an array of shape {list(sizes)}; name its axes, as in --axes "
+            f"{path}: expected frames [T, H, W], found an array of shape {list(sizes)}; name its axes, as in axes="
             f"{'YX' if len(sizes) == 2 else 'TCYX'}"
         )
     missing = [letter for letter in "YX" if letter not in axes]
     if missing:
-        raise ValueError(f"{path}: axes {axes} lack {' and '.join(missing)}; rename them with --axes")
+        raise ValueError(f"{path}: axes {axes} lack {' and '.join(missing)}; rename them with axes=")
     sizes_of = dict(zip(axes, sizes, strict=True))
     picks = _picks(path, axes, sizes_of, hints)
     spare = [letter for letter in axes if letter not in "YXS" and letter not in picks and sizes_of[letter] > 1]
@@ -103,9 +103,9 @@ def _checked(path: Path, given: str, sizes: tuple[int, ...]) -> str:
     if "Y" not in axes and "X" not in axes:
         axes = axes.replace("H", "Y").replace("W", "X")
     if not axes.isalpha() or len(set(axes)) < len(axes):
-        raise ValueError(f"{path}: --axes {given!r:.40}: a different letter for each axis is expected, as in TCYX")
+        raise ValueError(f"{path}: axes={given!r:.40}: a different letter for each axis is expected, as in TCYX")
     if len(axes) != len(sizes):
-        raise ValueError(f"{path}: --axes {given}: names {len(axes)} axes, and the array has {list(sizes)}")
+        raise ValueError(f"{path}: axes={given}: names {len(axes)} axes, and the array has {list(sizes)}")
     return axes
 
 
@@ -117,17 +117,17 @@ def _picks(path: Path, axes: str, sizes: dict[str, int], hints: Hints) -> dict[s
         if index is None:
             continue
         if index >= sizes[letter]:
-            raise ValueError(f"{path}: --{name} {index}: axis {letter} has {sizes[letter]}, from 0")
+            raise ValueError(f"{path}: {name}={index}: axis {letter} has {sizes[letter]}, from 0")
         found[letter] = index
     return found
 
 
 def _refuse(path: Path, axes: str, sizes: dict[str, int], spare: list[str]) -> None:
     said = ", ".join(f"{letter}={sizes[letter]}" for letter in axes)
-    cures = [f"--{PICKED[letter]} 0 (to {sizes[letter] - 1})" for letter in spare if letter in PICKED]
-    renamed = f"name the axis of the frames T, as in --axes {axes.replace(spare[0], 'T')}"
+    cures = [f"{PICKED[letter]}=0 (to {sizes[letter] - 1})" for letter in spare if letter in PICKED]
+    renamed = f"name the axis of the frames T, as in axes={axes.replace(spare[0], 'T')}"
     if cures:
         cure = f"choose with {' and '.join(cures)}" + ("" if "T" in axes else f", or {renamed}")
     else:
-        cure = renamed if "T" not in axes else "name them with --axes, as in TCYX"
+        cure = renamed if "T" not in axes else "name them with axes=, as in TCYX"
     raise ValueError(f"{path}: axes {said}: frames have one axis beside rows and columns; {cure}")

@@ -70,7 +70,7 @@ def bands_of(clip: Clip, planes: int) -> list[Stream]:
     if absent:
         raise ValueError(
             f"{clip.path}: has no stream called {absent[0]}; the challenge has the streams red, green and blue of one "
-            f"bit: make it with `qsim sense --bits 1 --name {absent[0]} --seed {COLOURS.index(absent[0]) + 1}`"
+            f"bit: make it with `qsim sense` with bits=1, name={absent[0]} and seed={COLOURS.index(absent[0]) + 1}"
         )
     bands = [clip.stream(name) for name in COLOURS]
     for band in bands:
@@ -80,22 +80,22 @@ def bands_of(clip: Clip, planes: int) -> list[Stream]:
             kind = type(band.sensor).__name__
             raise ValueError(
                 f"{band.path}: {band.bits}-bit codes {list(band.shape)} of a {kind}; the challenge has planes of one "
-                "bit of a clocked SPAD, as in --sensor spad512s --bits 1"
+                "bit of a clocked SPAD, as in sensor=spad512s bits=1"
             )
     for band, name in zip(bands, COLOURS, strict=True):
         filters = band.colour_filter
         if filters is not None and filters.mask != MASKS[name]:
             found = ", ".join(filters.mask)
-            raise ValueError(f"{band.path}: its filters are {found}, not {name}; sense it with --colour {name}")
+            raise ValueError(f"{band.path}: its filters are {found}, not {name}; sense it with colour={name}")
     seeds = [band.info.seed for band in bands]
     for n, seed in enumerate(seeds):
         if seed is not None and seed in seeds[:n]:
             raise ValueError(
                 f"{bands[n].path}: has the same seed {seed}, and so the same noise, as "
-                f"{COLOURS[seeds.index(seed)]}; sense it with another --seed"
+                f"{COLOURS[seeds.index(seed)]}; sense it with another seed="
             )
     if len(bands[0]) < planes:
-        raise ValueError(f"{clip.path}: {len(bands[0])} planes are fewer than the {planes} of a cube; give a --window")
+        raise ValueError(f"{clip.path}: {len(bands[0])} planes are fewer than the {planes} of a cube; give a window=")
     return bands
 
 

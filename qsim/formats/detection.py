@@ -84,7 +84,7 @@ def detect(path: Path, hints: Hints | None = None) -> str:
         return _detect_npy(path, hints or Hints())
     if suffix == ".bin":
         return _detect_raw(path)
-    raise ValueError(f"{path}: unknown kind of file; name it with `qsim convert --layout`: {', '.join(LAYOUTS)}")
+    raise ValueError(f"{path}: unknown kind of file; name its layout=: {', '.join(LAYOUTS)}")
 
 
 def recordings(folder: Path, layout: str | None) -> list[Path]:
@@ -119,8 +119,8 @@ def check_one_kind(folder: Path, found: list[Path]) -> None:
     others = sorted(file for file in files if file.suffix.lower() in kinds or file.name in ZARR)
     if others:
         raise ValueError(
-            f"{folder}: holds videos ({found[0]}) and other recordings ({others[0]}); choose with --layout, as in "
-            "--layout video or --layout png"
+            f"{folder}: holds videos ({found[0]}) and other recordings ({others[0]}); choose with layout=, as in "
+            "layout=video or layout=png"
         )
 
 
@@ -140,12 +140,12 @@ def _detect_folder(path: Path) -> str:
     kinds |= {kind: found[0] for kind, found in (("raw", raw), ("array", arrays)) if found}
     if len(kinds) > 1:
         first, second, *_ = kinds.values()
-        raise ValueError(f"{path}: holds recordings of two kinds ({first}, {second}); choose with --layout")
+        raise ValueError(f"{path}: holds recordings of two kinds ({first}, {second}); choose with layout=")
     if shown:
         return PICTURES[shown[0].suffix.lower()]
     if raw:
         return _detect_raw(raw_layout.raw_files(path)[0], many=True)
-    raise ValueError(f"{path}: a folder of unknown kind; name it with `qsim convert --layout`: {', '.join(LAYOUTS)}")
+    raise ValueError(f"{path}: a folder of unknown kind; name its layout=: {', '.join(LAYOUTS)}")
 
 
 def _detect_npy(path: Path, hints: Hints) -> str:
@@ -171,12 +171,12 @@ def _detect_npy(path: Path, hints: Hints) -> str:
     if bits < 8:  # every eighth column of packed planes would be dark
         raise ValueError(
             f"{path}: uint8 up to {top}: codes of {bits} bits, packed planes or dark pictures; choose with "
-            f"--layout codes (and --bits {bits}), --layout cube or --layout light"
+            f"layout=codes (and bits={bits}), layout=cube or layout=light"
         )
     if _smooth(array):
         raise ValueError(
-            f"{path}: uint8 up to {top}, much alike along rows: pictures or packed planes; choose with --layout light "
-            "(and --transfer) or --layout cube"
+            f"{path}: uint8 up to {top}, much alike along rows: pictures or packed planes; choose with layout=light "
+            "(and transfer=) or layout=cube"
         )
     return "cube"
 
@@ -212,4 +212,4 @@ def _detect_raw(path: Path, many: bool = False) -> str:
     least, second = sorted(found)[:2]
     clear = least < SMOOTH and second > SMOOTH * least
     tells = "the right one is usually near 1" if clear else "these frames are too noisy or too rough to tell"
-    raise ValueError(f"{path}: {size} bytes fit {', '.join(evidence)}; choose one with --layout ({tells})")
+    raise ValueError(f"{path}: {size} bytes fit {', '.join(evidence)}; choose one with layout= ({tells})")

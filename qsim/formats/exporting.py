@@ -44,7 +44,7 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     check(source, wanted)
     check_outside(path)
     if (path.exists() or path.is_symlink()) and not force:
-        raise FileExistsError(f"{path}: exists; name another, or use --force to replace it")
+        raise FileExistsError(f"{path}: exists; name another, or replace it with force=True")
     meta = _export_meta(source, wanted)
     path.parent.mkdir(parents=True, exist_ok=True)
     single = wanted.kind in ("cube", "mp4", "spike", "photons")
@@ -99,7 +99,7 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
     else:
         about = f"linear light in {source.info.radiance_unit}"
     if isinstance(source, Clip):
-        about += "; not written: codes, flow, depth (--to pairs writes codes, truth and flow)"
+        about += "; not written: codes, flow, depth (to=pairs writes codes, truth and flow)"
     rate = source.info.frame_rate
     if wanted.kind == "challenge":
         return made, f"challenge, {challenge.line(meta)}"
@@ -132,7 +132,7 @@ def _check_ours(place: Path, description: Path, single: bool) -> None:
 def _cube(source: Clip | Stream, path: Path, _wanted: Export, _meta: dict[str, Any]) -> None:
     if isinstance(source, Clip) or source.bits != 1:
         what = "a clip holds light" if isinstance(source, Clip) else f"this stream has {source.bits}"
-        raise ValueError(f"{source.path}: a photon cube holds one bit per pixel, {what}; sense it with --bits 1")
+        raise ValueError(f"{source.path}: a photon cube holds one bit per pixel, {what}; sense it with bits=1")
     array_files.write_cube(path, _code_blocks(source), source.shape)
 
 

@@ -93,7 +93,7 @@ def told(path: Path, recording: Recording, keep: bool) -> Recording:
         small, large, t = found.uneven
         said = f"{path}: {source}: steps from {small:.4g} to {large:.4g} {unit}, the largest after frame {t}"
         if keep:
-            raise ValueError(f"{said}; lost frames cannot be told from a variable rate, so leave --keep-gaps out")
+            raise ValueError(f"{said}; lost frames cannot be told from a variable rate, so leave keep_gaps=True out")
         warnings.warn(f"{said}; the frames are read as if they were even", stacklevel=4)
         return recording
     if not found.lost:
@@ -101,16 +101,16 @@ def told(path: Path, recording: Recording, keep: bool) -> Recording:
     said = f"{path}: {source}: {_listed(found, recording.times)}"
     if not keep:
         warnings.warn(
-            f"{said}; the frames on both sides are read as neighbours, and --keep-gaps stores lost ones as missing",
+            f"{said}; the frames on both sides are read as neighbours, and keep_gaps=True stores lost ones as missing",
             stacklevel=4,
         )
         return recording
     if not recording.is_light:
         raise ValueError(
-            f"{said}; streams of codes hold no missing frames: leave --keep-gaps out, or convert the parts one by one"
+            f"{said}; streams of codes hold no missing frames: leave keep_gaps=True out, or convert the parts"
         )
     if found.total > MOST_FILLED * recording.shape[0]:
-        raise ValueError(f"{said}; more than {MOST_FILLED} times the frames that exist, so leave --keep-gaps out")
+        raise ValueError(f"{said}; more than {MOST_FILLED} times the frames that exist, so leave keep_gaps=True out")
     return _filled(recording, found)
 
 

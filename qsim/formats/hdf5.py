@@ -47,7 +47,7 @@ def read_hdf5(path: Path, hints: Hints) -> Recording:
     source = f"HDF5 {name}"
     if not as_light and dtype.kind in "ui" and hints.bits is None:
         raise ValueError(
-            f"{path}: {name} holds {dtype} {list(shape)}; add --bits for codes, or --transfer linear for light"
+            f"{path}: {name} holds {dtype} {list(shape)}; add bits= for codes, or transfer=linear for light"
         )
     values = Values(shape, dtype, read)
     return light_of(path, values, source, hints) if as_light else codes_of(path, values, source, hints)
@@ -93,7 +93,7 @@ def _only(path: Path, found: dict[str, tuple[int, ...]]) -> str:
         return videos[0]
     if not videos:
         raise ValueError(f"{path}: holds no array of frames")
-    raise ValueError(f"{path}: holds {_listed(found)}; choose with --dataset, as in --dataset {videos[0]}")
+    raise ValueError(f"{path}: holds {_listed(found)}; choose with dataset=, as in dataset={videos[0]}")
 
 
 def _listed(found: dict[str, tuple[int, ...]]) -> str:

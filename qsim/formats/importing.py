@@ -58,9 +58,7 @@ def read(path: Path | str, hints: Hints | None = None, *, compared: tuple[str, .
     for field in fields(Hints):
         given = getattr(hints, field.name) != field.default
         if given and field.name not in asked:
-            raise ValueError(
-                f"{path}: --{field.name.replace('_', '-')} changes nothing for {recording.format}; leave it out"
-            )
+            raise ValueError(f"{path}: {field.name}= changes nothing for {recording.format}; leave it out")
     if layout in ASSUMED:
         recording = with_stated_layout(recording, *ASSUMED[layout])
     return gaps.told(path, reoriented(recording, hints), hints.keep_gaps)
@@ -114,7 +112,7 @@ def to_clip(
         )
     if capture.sensor is not None or capture.ppp is not None:
         name = "sensor" if capture.sensor is not None else "ppp"
-        raise ValueError(f"{path}: {recording.format} holds light, which no sensor made; leave --{name} out")
+        raise ValueError(f"{path}: {recording.format} holds light, which no sensor made; leave {name}= out")
     check_outside(path)
     capture = _as_stated(path, recording, capture)
     recording = _within_halves(recording)
@@ -182,12 +180,12 @@ def saturation_line(clip: Clip) -> str:
     share = f"{100 * count / math.prod(clip.shape):.3g} % of pixels"
     cut = "" if source.scale is None else f"; the light of the file is scaled by {source.scale:g}"
     if white is None:
-        return "saturation not known: floats have no largest value; give it with --white" + cut
+        return "saturation not known: floats have no largest value; give it with white=" + cut
     said = f"white {white:g}{' assumed' if known.assumed else ''}"
     if count:
         return f"{said}: {share} saturated{cut}"
     return f"{said}: no pixel reaches it{cut}" + (
-        "; if the camera saturates below it, give --white" if known.assumed else ""
+        "; if the camera saturates below it, give white=" if known.assumed else ""
     )
 
 
@@ -203,21 +201,21 @@ def to_stream(
             f"{path}: {recording.format} holds light, not codes; name a clip folder to make, as in out/clip"
         )
     if capture.split is not None:
-        raise ValueError(f"{path}: --split is stored in clips, and {recording.format} becomes a stream; leave it out")
+        raise ValueError(f"{path}: split= is stored in clips, and {recording.format} becomes a stream; leave it out")
     if capture.ppp is not None and capture.sensor is None:
-        raise ValueError(f"{path}: --ppp sets the gain of a named sensor; name it with --sensor, or leave --ppp out")
+        raise ValueError(f"{path}: ppp= sets the gain of a named sensor; name it with sensor=, or leave ppp= out")
     device = devices.DEVICES.get(str(capture.sensor))
     if capture.ppp is not None and not (device is not None and device.follows_light):
-        raise ValueError(f"{path}: --ppp changes nothing for {capture.sensor}, whose gain is fixed; leave it out")
+        raise ValueError(f"{path}: ppp= changes nothing for {capture.sensor}, whose gain is fixed; leave it out")
     check_outside(path)
     stem = path.with_suffix("") if path.suffix in (".npy", ".json") else path
     npy, description = (stem.with_name(f"{stem.name}{end}") for end in (".npy", ".json"))  # a stem may hold dots
     for file in (npy, description):
         if file.exists() and not force:
-            raise FileExistsError(f"{file}: exists; name another, or use --force to replace it")
+            raise FileExistsError(f"{file}: exists; name another, or replace it with force=True")
         if file.exists() and (not description.is_file() or not is_stream(description)):
             raise FileExistsError(
-                f"{file}: is not a stream, which is all that --force replaces; move it away, or name another"
+                f"{file}: is not a stream, which is all that is replaced; move it away, or name another"
             )
     frames, height, width = recording.shape
     if recording.source.bitplanes is not None:
@@ -258,10 +256,10 @@ def _as_stated(path: Path, recording: Recording, capture: Import) -> Import:
     exposure = recording.exposure
     if rate is None or exposure is None:
         return capture
-    given = (("frame-rate", capture.frame_rate, rate), ("exposure", capture.exposure or exposure, exposure))
+    given = (("frame_rate", capture.frame_rate, rate), ("exposure", capture.exposure or exposure, exposure))
     for name, value, stated in given:
         if not math.isclose(value, stated, rel_tol=1e-6):
-            raise ValueError(f"{path}: --{name} {value:g}: {recording.format} state {stated:g}; leave it out")
+            raise ValueError(f"{path}: {name}={value:g}: {recording.format} state {stated:g}; leave it out")
     return replace(capture, exposure=exposure)
 
 

@@ -106,7 +106,7 @@ def _chosen(path: Path, variable: str | None, shapes: dict[str, tuple[int, ...]]
         return images[0]
     if not images:
         raise ValueError(f"{path}: has no array of frames; it holds {sorted(shapes)}")
-    raise ValueError(f"{path}: holds the arrays {images}; choose one with --variable {images[0]}")
+    raise ValueError(f"{path}: holds the arrays {images}; choose one with variable={images[0]}")
 
 
 def _frames_first(path: Path, name: str, planes: Array) -> Array:

@@ -85,7 +85,7 @@ def windows(splits: Mapping[str, Sequence[Clip]], frames: int) -> dict[str, list
     if not found:
         clips = [clip for clips in splits.values() for clip in clips]
         there = "no stream" if not any(clip.streams for clip in clips) else f"no stream of {frames} codes"
-        raise ValueError(f"{there} in {len(clips)} clips; make streams with `qsim sense`, or give a smaller --window")
+        raise ValueError(f"{there} in {len(clips)} clips; make streams with `qsim sense`, or give a smaller window=")
     every = [window for group in found.values() for window in group]
     sizes = {window.clip.shape[1:]: window.clip.name for window in every}
     if len(sizes) > 1:
@@ -159,7 +159,7 @@ def _check_target(path: Path, force: bool) -> None:
     if not (path.exists() or path.is_symlink()):
         return
     if not force:
-        raise FileExistsError(f"{path}: exists; name another, or use --force to replace it")
+        raise FileExistsError(f"{path}: exists; name another, or replace it with force=True")
     ours = False
     if path.is_file() and not path.is_symlink() and h5py.is_hdf5(path):
         with h5py.File(path, "r") as file:

@@ -132,7 +132,7 @@ def write(stream: Stream, path: Path) -> int:
     rate = stream.info.frame_rate
     found = PhotonTimes((frames, height, width), stream.exposure, rate, times, kind, first)
     if not np.array_equal(np.minimum(found.counts(), stream.sensor.levels - 1), stream.codes()):
-        raise ValueError(f"{stream.path}: its codes are not the counts of its photons; sense it again with --force")
+        raise ValueError(f"{stream.path}: its codes are not the counts of its photons; sense it again and replace it")
     meta = {"format": FORMAT, "shape": [frames, height, width], "exposure": stream.exposure, "frame_rate": rate}
     rows = {} if stream.rows is None else {"rows": stream.rows.to_dict()}
     text = files.to_json(meta | {"sensor": stream.info.sensor} | rows)

@@ -89,7 +89,7 @@ def read_spike(path: Path, hints: Hints) -> Recording:
         height = int(found.get("spike_h", 0)) or None
         width = int(found.get("spike_w", 0)) or None
     if height is None or width is None:
-        raise ValueError(f"{path}: a spike file does not hold its size; add --height and --width, as in 250 and 400")
+        raise ValueError(f"{path}: a spike file does not hold its size; add height= and width=, as in 250 and 400")
     check_shape(path, (1, height, width))
     if height * width % 8:
         raise ValueError(f"{path}: spike frames fill whole bytes, {height} x {width} pixels do not")

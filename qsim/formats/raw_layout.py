@@ -126,16 +126,16 @@ def read_raw(path: Path, hints: Hints) -> Recording:
     assert hints.bits is not None
     convert(hints.bits, Bits, f"{path}: bits")
     if hints.order is not None and hints.endian is not None and hints.bits != 8:
-        raise ValueError(f"{path}: --order states packed pixels, --endian pixels of whole bytes; leave one of them out")
+        raise ValueError(f"{path}: order= states packed pixels, endian= pixels of whole bytes; leave one of them out")
     layout = _with_gaps(Layout(hints.height, hints.width, hints.bits), hints)
     if hints.bits == 1 or (hints.bits not in (8, 16) and hints.endian is None):
         if hints.order is None:
-            more = "" if hints.bits == 1 else ", or --endian little or big if each pixel fills whole bytes"
-            raise ValueError(f"{path}: pixels of {hints.bits} bits; add --order msb or lsb if they are packed{more}")
+            more = "" if hints.bits == 1 else ", or endian=little or big if each pixel fills whole bytes"
+            raise ValueError(f"{path}: pixels of {hints.bits} bits; add order=msb or lsb if they are packed{more}")
         layout = replace(layout, order=_one_of(path, "order", hints.order, ORDERS))
     elif layout.pixel_bytes == 2:
         if hints.endian is None:
-            raise ValueError(f"{path}: pixels of 16 bits; add --endian little or --endian big")
+            raise ValueError(f"{path}: pixels of 16 bits; add endian=little or endian=big")
         layout = replace(layout, endian=_one_of(path, "endian", hints.endian, ENDIANS))
     else:
         _ = hints.endian  # 8 bits or fewer in a byte each
@@ -283,7 +283,7 @@ def _beside(path: Path, endings: tuple[str, ...]) -> Path:
 
 
 def _need(path: Path, facts: dict[str, int | None]) -> None:
-    missing = [f"--{name}" for name, value in facts.items() if value is None]
+    missing = [f"{name}=" for name, value in facts.items() if value is None]
     if missing:
         raise ValueError(f"{path}: raw frames do not state their layout; add {' and '.join(missing)}")
 
@@ -294,7 +294,7 @@ def _with_gaps(layout: Layout, hints: Hints) -> Layout:
 
 def _one_of(path: Path, name: str, value: str, known: tuple[str, ...]) -> str:
     if value not in known:
-        raise ValueError(f"{path}: --{name} {value!r:.40}: known are {', '.join(known)}")
+        raise ValueError(f"{path}: {name}={value!r:.40}: known are {', '.join(known)}")
     return value
 
 

@@ -156,9 +156,9 @@ def _without_black(path: Path, marked: Marked, black: float, transfer: str, full
     Pixels of whole numbers, of which `full` is the largest, are light of 0 ... 1 again; floats keep their unit.
     """
     if transfer != "linear":
-        raise ValueError(f"{path}: --black acts on linear pixels, and --transfer is {transfer}; leave it out")
+        raise ValueError(f"{path}: black= acts on linear pixels, and transfer= is {transfer}; leave it out")
     if not black < full:
-        raise ValueError(f"{path}: --black {black:g}: expected less than the largest value {full:g}")
+        raise ValueError(f"{path}: black={black:g}: expected less than the largest value {full:g}")
     floats = full == float("inf")
     dark = np.float32(black if floats else black / full)
     gain = np.float32(1.0 if floats else full / (full - black))
@@ -197,7 +197,7 @@ def white_of(path: Path, hints: Hints, full: float) -> tuple[float | None, bool]
     if hints.white is None:
         return (None, True) if full == float("inf") else (full, True)
     if not 0 < hints.white <= full or hints.white == float("inf"):
-        raise ValueError(f"{path}: --white {hints.white:g}: pixels hold values up to {full:g}; give one of them")
+        raise ValueError(f"{path}: white={hints.white:g}: pixels hold values up to {full:g}; give one of them")
     return hints.white, False
 
 
@@ -212,7 +212,7 @@ def reached(values: Array, white: float | None, colour: bool = False) -> Array:
 def need_transfer(path: Path, hints: Hints) -> str:
     """Return the transfer curve that the user states; `ValueError` without one."""
     if hints.transfer is None:
-        known = " or ".join(f"--transfer '{name}'" for name in TRANSFERS)
+        known = " or ".join(f"transfer='{name}'" for name in TRANSFERS)
         raise ValueError(f"{path}: a picture does not state its transfer curve; add {known}")
     if hints.transfer not in TRANSFERS:
         raise ValueError(f"transfer {hints.transfer!r}: known are {', '.join(TRANSFERS)}")
@@ -231,9 +231,9 @@ def reoriented(recording: Recording, hints: Hints) -> Recording:
     frames, height, width = recording.shape
     columns = width if hints.columns is None else hints.columns
     if not 0 < columns <= width:
-        raise ValueError(f"--columns {columns}: the frames have {width} columns")
+        raise ValueError(f"columns={columns}: the frames have {width} columns")
     if hints.flip not in ("none", "lr", "ud", "both"):
-        raise ValueError(f"--flip {hints.flip!r}: known are lr, ud, both")
+        raise ValueError(f"flip={hints.flip!r}: known are lr, ud, both")
     if hints.flip == "none" and columns == width:
         return recording
     rows = slice(None, None, -1 if hints.flip in ("ud", "both") else 1)
@@ -249,7 +249,7 @@ def reoriented(recording: Recording, hints: Hints) -> Recording:
 
     source = replace(recording.source, flip=hints.flip, columns_kept=columns)
     if hints.flip != "none":
-        source = replace(source, orientation=f"{source.orientation or 'unknown'}; then --flip {hints.flip}")
+        source = replace(source, orientation=f"{source.orientation or 'unknown'}; then flip={hints.flip}")
     kept = marked if recording.marked is not None else None
     return replace(recording, shape=(frames, height, columns), read=read, source=source, marked=kept)
 
@@ -265,7 +265,9 @@ def checked_codes(path: Path, values: Array, bits: int, first: int) -> Array:
         wrong |= ~(values >= 0) | (values != np.floor(values))
     if wrong.any():
         t, y, x = (int(i) for i in np.argwhere(wrong)[0])
-        cure = "give the right --bits, or --stretched" if values[t, y, x] > top else "codes are whole numbers from 0 on"
+        cure = (
+            "give the right bits=, or stretched=True" if values[t, y, x] > top else "codes are whole numbers from 0 on"
+        )
         raise ValueError(
             f"{path}: value {values[t, y, x]} at (t, y, x) = ({first + t}, {y}, {x}) is not a {bits}-bit code "
             f"(0..{top}); {cure}"

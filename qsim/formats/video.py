@@ -78,7 +78,7 @@ def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossl
                 stream.height, stream.width = image.shape[:2]
                 stream.codec_context.pix_fmt = "gray" if lossless else "yuv420p"
                 if not lossless and (image.shape[0] % 2 or image.shape[1] % 2):
-                    other = "leave --lossy out" if image.ndim == 2 else "write pictures, with --to png"
+                    other = "leave lossy=True out" if image.ndim == 2 else "write pictures, with to=png"
                     raise ValueError(f"{path}: lossy H.264 needs even sizes, the frames are {image.shape[:2]}; {other}")
             picture = av.VideoFrame.from_ndarray(image, format="gray" if image.ndim == 2 else "rgb24")
             if lossless:  # mark the range as 0 ... 255, or decoders stretch 16 ... 235

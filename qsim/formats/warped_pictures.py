@@ -1,6 +1,6 @@
 """Makes clips of warped pictures: photographs and shapes cut from them that slide, turn and zoom before one another.
 
-    python -m qsim.formats.warped_pictures PICTURES -o out/photos --licence FILE --clips 300 --split train
+    make(WarpedPictures(PICTURES, "out/photos", FILE))  # as `python -m qsim.cli.warped_pictures` does
 
     pictures -> layers (a background, bodies of random outline) -> relative radiance, exact flow, one clip per number
 
@@ -14,26 +14,27 @@ per number, and the licences.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy import ndarray as Array
 from scipy import ndimage
 
-from qsim import checks, files
+from qsim import files
 from qsim.clip.clip_info import ClipInfo
 from qsim.clip.source import Source
 from qsim.clip.writer import ClipWriter
-from qsim.kinds import Frames, Seed
-from qsim.records import convert
+from qsim.kinds import Frames, Seed, Split
 from qsim.scene.image_files import read_grey
 from qsim.scene.textures import noise, pictures_in
+from qsim.settings import setting
 from qsim.streams.clip import Clip
-from qsim.terminal import printable
+
+Motion = Annotated[float, Meta(ge=0.0, le=100.0)]  # px/frame
 
 FINE = 2  # texels of a layer per pixel, at zoom 1
 SAMPLES = 3  # per pixel along each side
@@ -227,42 +228,64 @@ def write_clip(path: Path, parts: Sequence[Layer], size: tuple[int, int], info: 
     return Clip.open(path)
 
 
-def make(folder: Path, pictures: Path, licence: Path, args: argparse.Namespace) -> int:
-    """Write the missing clips below `folder`, and return their number; `ValueError` for a clip of other settings."""
-    size = (args.height, args.width)
-    paths = pictures_in(pictures)
+@dataclass(frozen=True)
+class WarpedPictures:
+    """The clips that are made, and of which pictures."""
+
+    pictures: Annotated[Path, setting("folder of pictures (.jpg, .png, .tif), sRGB", positional=True)]
+    output: Annotated[Path, setting("folder of the clips", short="o")]
+    licence: Annotated[Path, setting("file with the pictures' licence; it is copied")]
+    clips: Annotated[Frames, setting("number of clips")] = 300
+    first: Annotated[Seed, setting("number of the first clip")] = 0
+    frames: Annotated[Frames, setting("frames of a clip")] = 16
+    height: Annotated[Frames, setting("pixels")] = 112
+    width: Annotated[Frames, setting("pixels")] = 112
+    motion: Annotated[Motion, setting("largest motion, px/frame")] = 16.0
+    split: Annotated[Split, setting("stored in the clips")] = "train"
+    seed: Annotated[Seed, setting("of everything random")] = 0
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of a frame [px]."""
+        return self.height, self.width
+
+    @property
+    def places(self) -> dict[int, Path]:
+        """The folder of each clip, by its number."""
+        return {n: self.output / f"warped_{n:05d}" for n in range(self.first, self.first + self.clips)}
+
+
+def make(asked: WarpedPictures) -> int:
+    """Write the missing clips, and return their number; `ValueError` for a clip of other settings."""
+    size = asked.size
+    folder = asked.output
+    licence = asked.licence
+    paths = pictures_in(asked.pictures)
     lights = read_pictures(paths, max(size))
     if not licence.is_file():
         raise FileNotFoundError(f"{licence}: no such file; name the file that states the licence of the pictures")
     digests = [f"texture {files.sha256(path)}" for path in paths]
-    numbers = range(args.first, args.first + args.clips)
-    places = {n: clip_path(folder, n) for n in numbers}
-    missing = {n: path for n, path in places.items() if not path.exists()}
-    for n, path in places.items():
+    missing = {n: path for n, path in asked.places.items() if not path.exists()}
+    for n, path in asked.places.items():
         if n not in missing:
-            _check_same(path, _described(n, digests, args))
+            _check_same(path, _described(n, digests, asked))
     folder.mkdir(parents=True, exist_ok=True)
     _copy_licence(licence, folder)
     for n, path in missing.items():
-        rng = np.random.default_rng([args.seed, n])
-        write_clip(path, layers(lights, size, args.motion, rng), size, _described(n, digests, args))
+        rng = np.random.default_rng([asked.seed, n])
+        write_clip(path, layers(lights, size, asked.motion, rng), size, _described(n, digests, asked))
     return len(missing)
 
 
-def clip_path(folder: Path, n: int) -> Path:
-    """Return the folder of clip n."""
-    return folder / f"warped_{n:05d}"
-
-
-def _described(n: int, digests: list[str], args: argparse.Namespace) -> ClipInfo:
+def _described(n: int, digests: list[str], asked: WarpedPictures) -> ClipInfo:
     """Return the description of clip n, without what its writer measures."""
     return ClipInfo(
-        shape=(args.frames, args.height, args.width),
+        shape=(asked.frames, asked.height, asked.width),
         frame_rate=2000.0,
         exposure=1 / 2000.0,
-        split=args.split,
+        split=asked.split,
         assets=tuple(digests),
-        source=Source(format="warped pictures", seed=args.seed, number=n, motion=args.motion),
+        source=Source(format="warped pictures", seed=asked.seed, number=n, motion=asked.motion),
     )
 
 
@@ -271,7 +294,7 @@ def _check_same(path: Path, wanted: ClipInfo) -> None:
     there = Clip.open(path).info
     for key, what in (("shape", "size"), ("assets", "set of pictures"), ("source", "seed or motion")):
         if getattr(there, key) != getattr(wanted, key):
-            raise ValueError(f"{path}: was made with another {what}; name another folder, or another --first")
+            raise ValueError(f"{path}: was made with another {what}; name another folder, or another first=")
 
 
 def _copy_licence(licence: Path, folder: Path) -> None:
@@ -281,40 +304,3 @@ def _copy_licence(licence: Path, folder: Path) -> None:
     if copy.is_file() and copy.read_bytes() != text:
         copy = folder / f"LICENCE-{files.sha256(text)[:8]}.txt"
     files.write_bytes(copy, text)
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the program; return its exit code."""
-    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("pictures", type=Path, help="folder of pictures (.jpg, .png, .tif), sRGB")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the clips")
-    parser.add_argument("--licence", type=Path, required=True, help="file with the pictures' licence; it is copied")
-    parser.add_argument("--clips", type=int, default=300, help="number of clips (default 300)")
-    parser.add_argument("--first", type=int, default=0, help="number of the first clip (default 0)")
-    parser.add_argument("--frames", type=int, default=16, help="per clip (default 16)")
-    parser.add_argument("--height", type=int, default=112, help="pixels (default 112)")
-    parser.add_argument("--width", type=int, default=112, help="pixels (default 112)")
-    parser.add_argument("--motion", type=float, default=16.0, help="largest motion, px/frame (default 16)")
-    parser.add_argument("--split", choices=checks.SPLITS, default="train", help="stored in the clips (default train)")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
-    args = parser.parse_args(words)
-    try:
-        for name in ("clips", "frames", "height", "width"):
-            convert(getattr(args, name), Frames, f"--{name}")
-        for name in ("seed", "first"):
-            convert(getattr(args, name), Seed, f"--{name}")
-        if not 0 <= args.motion <= 100:
-            raise ValueError(f"--motion: expected 0 to 100 px/frame, got {args.motion!r}")
-        made = make(args.output, args.pictures, args.licence, args)
-    except (ValueError, OSError) as error:
-        print(printable(f"warped_pictures: {files.wording(error)}"), file=sys.stderr)
-        return 2
-    numbers = range(args.first, args.first + args.clips)
-    others = sum(Clip.open(clip_path(args.output, n)).info.split != args.split for n in numbers)
-    kept = f"; {others} of these keep another split than {args.split}" if others else ""
-    print(printable(f"{args.output}: {made} clips made, {args.clips - made} were there{kept}"))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -141,7 +141,7 @@ def _cure(mi: Any, reason: str) -> str:
     """Return what helps against a spectrum that grey rendering lacks, or that no rendering here has."""
     if "non-spectral" in reason:
         return "; wavelengths are not rendered here: give the colour of this spectrum as <rgb> or <float>"
-    return "" if mi.variant().endswith("_rgb") else "; if it needs colour, render with --bands rgb (bands='rgb')"
+    return "" if mi.variant().endswith("_rgb") else "; if it needs colour, render with bands='rgb'"
 
 
 def _check_flicker(path: Path, name: str, flicker: Flicker, loaded: Any, parameters: Any) -> None:

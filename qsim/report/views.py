@@ -84,7 +84,7 @@ def _refuse(path: Path, what: str, **options: int | str | None) -> None:
     """Raise `ValueError` for options that do not apply to the content of a path."""
     for name, value in options.items():
         if value is not None:
-            raise ValueError(f"{path}: is {what}; leave out --{name}")
+            raise ValueError(f"{path}: is {what}; leave out {name}=")
 
 
 def _clip_source(clip: Clip, chosen: str | None) -> Source:
@@ -157,12 +157,12 @@ def _array_source(path: Path, bits: int | None, width: int | None, video: Restor
         _refuse(path, "an array of truth values", bits=bits, width=width)
         bits = 1
     elif width is not None:
-        _refuse(path, "packed planes of 1 bit (--width)", bits=bits)
+        _refuse(path, "packed planes of 1 bit (width=)", bits=bits)
         return _packed_source(path, array, width)
     if bits is None:
-        raise ValueError(f"{path}: whole numbers are codes or packed planes; add --bits 3, or --width 320 for planes")
+        raise ValueError(f"{path}: whole numbers are codes or packed planes; add bits=3, or width=320 for planes")
     if not 1 <= bits <= 16:
-        raise ValueError(f"--bits: expected 1 to 16, got {bits}")
+        raise ValueError(f"bits=: expected 1 to 16, got {bits}")
 
     def read(start: int, stop: int) -> NDArray[Any]:
         return checked_codes(path, np.asarray(array[start:stop]), bits, start)

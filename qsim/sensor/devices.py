@@ -113,7 +113,7 @@ _PHYSICAL_RULE = "min(0.5 (2^bits - 1) / PPP, 1); the same rule, with at most on
 
 def _need(name: str, ppp: float | None) -> float:
     if ppp is None:
-        raise ValueError(f"{name}: the gain follows the light level; give the photons per pixel (--ppp)")
+        raise ValueError(f"{name}: the gain follows the light level; give the photons per pixel (ppp=)")
     return ppp
 
 
@@ -267,9 +267,7 @@ def load(
         return made.with_dark_rate(made.dark_rate * conditions.dark.mean) if device.median and conditions.dark else made
     path = file_path(name)
     if path.suffix != ".toml":
-        raise ValueError(
-            f"unknown sensor {str(name)!r}{suggest(str(name), DEVICES)}; `qsim doctor --devices` lists all"
-        )
+        raise ValueError(f"unknown sensor {str(name)!r}{suggest(str(name), DEVICES)}; `qsim sensors` lists all")
     sensor = from_toml(path, bits, conditions)
     if bits is not None and bits != sensor.bits:
         raise ValueError(f"{path}: the file has bits = {sensor.bits}, the request {bits}; change one of them")
@@ -291,7 +289,7 @@ def from_toml(path: str | Path, bits: int | None = None, conditions: Conditions 
         raise ValueError(f"{path}: a table [sensor] with model, bits and the model's fields is missing")
     if "bits" not in tables["sensor"] and not _has_one_depth(tables["sensor"].get("model")):
         if bits is None:
-            raise ValueError(f"{path}: states no bits, so it serves every depth; say which one, as in --bits 3")
+            raise ValueError(f"{path}: states no bits, so it serves every depth; say which one, as in bits=3")
         tables["sensor"]["bits"] = bits
     table = tables["sensor"]
     if "median" in table and conditions.dark is None and isinstance(tables.get("defects"), dict):

@@ -43,7 +43,7 @@ def light_level(
         return _relative_level(clip, ppp, lux, pixel_pitch)
     if pixel_pitch is not None:
         raise ValueError(
-            f"{clip.name}: its camera has pixels of {1e6 * camera.pixel_pitch:g} um; leave --pixel-pitch out"
+            f"{clip.name}: its camera has pixels of {1e6 * camera.pixel_pitch:g} um; leave pixel_pitch= out"
         )
     per_lux = photons_per_lux(camera, clip.exposure)
     if lux is not None:
@@ -58,18 +58,18 @@ def _relative_level(clip: ClipFolder, ppp: float | None, lux: float | None, pixe
     if ppp is None and lux is None:
         raise ValueError(
             f"{clip.name}: its radiance is relative (imported video) and has no absolute light; "
-            "give a target in photons per pixel, as in --ppp 3.25"
+            "give a target in photons per pixel, as in ppp=3.25"
         )
     if lux is not None and pixel_pitch is None:
         one = photons_per_lux_of(EXAMPLE_PITCH**2, clip.exposure)
         raise ValueError(
             f"{clip.name}: its radiance is relative (imported video) and has no pixel size, which lux need; give "
-            f"--pixel-pitch, as in --pixel-pitch {EXAMPLE_PITCH:g}, where 1 lx at 555 nm is {one:.3g} PPP in "
-            f"{1e3 * clip.exposure:.4g} ms; or --ppp"
+            f"pixel_pitch=, as in pixel_pitch={EXAMPLE_PITCH:g}, where 1 lx at 555 nm is {one:.3g} PPP in "
+            f"{1e3 * clip.exposure:.4g} ms; or ppp="
         )
     per_lux = None
     if pixel_pitch is not None:
-        per_lux = photons_per_lux_of(checked_pitch(pixel_pitch, f"{clip.name}: --pixel-pitch") ** 2, clip.exposure)
+        per_lux = photons_per_lux_of(checked_pitch(pixel_pitch, f"{clip.name}: pixel_pitch=") ** 2, clip.exposure)
         if lux is not None:
             ppp = lux * per_lux
     assert ppp is not None

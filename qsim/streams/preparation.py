@@ -39,9 +39,9 @@ def _fitting_filters(clip: ClipFolder, sensing: Sensing, recorded: bool) -> Colo
     if (found is None) == (clip.bands is None):
         return None if found is None else found.shifted(*clip.origin)
     if found is None:
-        cure = "give some, as in --colour rggb, or a table [colour] in the sensor's file"
+        cure = "give some, as in colour=rggb, or a table [colour] in the sensor's file"
         raise ValueError(f"{clip.name}: has three bands and {sensing.sensor_name} no colour filters; {cure}")
-    raise ValueError(f"{clip.name}: has one band, and the sensor has colour filters; render it with --bands rgb")
+    raise ValueError(f"{clip.name}: has one band, and the sensor has colour filters; render it with bands=rgb")
 
 
 def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sensor | None = None) -> Draw:
@@ -49,7 +49,7 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     filters = _fitting_filters(clip, sensing, own is not None)
     planes = sensing.planes
     if sensing.group and sensing.depth is None:
-        raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in --bits 3")
+        raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in bits=3")
     if not 1 <= planes <= len(clip):
         what = f"one code of {planes} planes" if sensing.group else f"one exposure of {planes} slices"
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")

@@ -25,9 +25,7 @@ class Sensing:
     `ValueError` for values out of their bounds, and for settings that exclude each other.
     """
 
-    sensor: Annotated[
-        Text | Sensor, setting("a name of `qsim doctor --devices`, or a .toml file", known=devices.DEVICES.keys)
-    ]
+    sensor: Annotated[Text | Sensor, setting("a name of `qsim sensors`, or a .toml file", known=devices.DEVICES.keys)]
     bits: Annotated[Bits | None, setting("bits per code", unset="the sensor's own", varied=True)] = None
     ppp: Annotated[
         Light | None,

@@ -131,6 +131,6 @@ class Draw:
         """
         if self.followed is None:
             raise ValueError(
-                f"{clip.name}: its codes were not drawn photon by photon; sense a CountingSPAD with --follow"
+                f"{clip.name}: its codes were not drawn photon by photon; sense a CountingSPAD with follow=True"
             )
         return self._drawer(clip, Followed).trace(frames)

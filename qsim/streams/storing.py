@@ -130,7 +130,9 @@ def _kept(clip: ClipFolder, sensing: Sensing, info: StreamInfo) -> Stream | None
         return None
     if old.info.compared == info.compared:
         return old
-    raise FileExistsError(f"{json_path}: exists with other settings; name this stream with --name, or use --force")
+    raise FileExistsError(
+        f"{json_path}: exists with other settings; give the stream a name=, or replace it with force=True"
+    )
 
 
 def replay(clip: ClipFolder, stream: Stream, frame: int) -> tuple[Array, Array]:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from qsim.sensor.colour_filter import ColourFilter
     from qsim.sensor.sensor import Sensor
 
-_DAMAGED = "the file is damaged: run `qsim sense --force`"
+_DAMAGED = "the file is damaged: sense it again and replace it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,12 +257,12 @@ class Stream:
         frames, height, width = self.shape
         expected = (frames, height, packing.packed_width(width, self.bits))
         if not self.path.is_file():
-            raise FileNotFoundError(f"{self.path}: no such file, but its json exists; run `qsim sense --force`")
+            raise FileNotFoundError(f"{self.path}: no such file, but its json exists; sense it again and replace it")
         array = files.load_array(self.path)
         if array.shape != expected or array.dtype != np.uint8:
             raise ValueError(
                 f"{self.path}: expected uint8 {list(expected)}, found {array.dtype} {list(array.shape)}; "
-                "run `qsim sense --force`"
+                "sense it again and replace it"
             )
         return array
 

@@ -38,7 +38,7 @@ def restore(asked: RestoreSettings, options: RestoreOptions, limit: ResumedThrea
     codes = codes_to_restore(asked)
     for path in (target, target.with_suffix(".json")):
         if path.exists() and not asked.force and not unnamed(target):  # restore_to_file finishes its naming
-            raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
+            raise FileExistsError(f"{path}: exists; name another, or replace it with --force")
     threads.check(limit.threads)
     method, why = chosen(asked.method, codes, options)
     refuse_idle(given(options) | {"method": asked.method}, [method])

@@ -16,6 +16,7 @@ from qsim.checks import ArgumentError
 from qsim.cli.command import command
 from qsim.cli.console import RESUMES, WITHOUT_FORCE, failed, note, output, running
 from qsim.cli.options import check_free
+from qsim.files import Blocked, Damaged
 from qsim.kinds import Split
 from qsim.settings import setting
 from quiver.cli.options import handling, use_threads
@@ -94,7 +95,8 @@ def train(asked: Train, given: Annotated[dict[str, Any], Settings]) -> int:
                 note=note,
             )
     except Diverged as error:
-        return failed(f"quiver: {error}", DIVERGED, running().printing.json and leads)
+        text = f"{error.problem}; lower the learning rate and start again with --force"
+        return failed(f"quiver: {text}", DIVERGED, running().printing.json and leads)
     if leads:
         draw_curve(folder, state.history)
         output(*_summary(folder, state))
@@ -244,13 +246,11 @@ def ablate(
             while_training=_signals(interrupted),
             progress=not running().silent,
         )
-    except Diverged as error:
-        text = _without_force(error, "choose another --protocol or --seed, and another -o")
+    except Diverged as error:  # the runs of an ablation are not replaced one by one
+        text = f"{error.problem}; choose another --protocol or --seed, and another -o"
         return failed(f"quiver: {text}", DIVERGED, running().printing.json)
-    except (FileExistsError, ValueError) as error:
-        if "--force" not in str(error):
-            raise
-        raise FileExistsError(_without_force(error, "choose another -o")) from error
+    except (Blocked, Damaged) as error:
+        raise FileExistsError(f"{error.problem}; choose another -o") from error
     if found is None:
         return failed("quiver: interrupted; the same command resumes where it stopped", 130, running().printing.json)
     methods, rows = found
@@ -268,12 +268,3 @@ def _check_scored(data: str, split: str) -> None:
     if (Path(data) / "clip.json").exists():
         raise ValueError(f"{data}: is one clip, which trains; give a data set with clips in split {split}")
     raise ValueError(f"--split {split}: {data} has no finished clip in that split; choose another one")
-
-
-def _without_force(error: Exception, advice: str) -> str:
-    """Return the text of an error; where its last clause advises --force, which `quiver ablate` lacks, with this advice
-    instead.
-    """
-    text = str(error)
-    kept, _, last = text.rpartition("; ")
-    return f"{kept}; {advice}" if kept and "--force" in last else text

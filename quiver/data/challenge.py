@@ -30,7 +30,7 @@ def band_codes(cube: Cube, colour: int, planes: int) -> Codes:
     bits = plane_bits(planes)
     frames, height, width = cube.shape
     if frames < planes:
-        raise ValueError(f"{cube.path}: {frames} planes are fewer than the {planes} of one code; give fewer --planes")
+        raise ValueError(f"{cube.path}: {frames} planes are fewer than the {planes} of one code; give fewer planes")
     skipped = frames % planes
     packed = cube.packed[..., colour]
 

@@ -214,7 +214,7 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
             t, y, x = (int(i) for i in np.argwhere((part < 0) | (part >= sensor.levels))[0])
             raise ValueError(
                 f"{name}: code {part[t, y, x]} at (t, y, x) = {(t + start, y, x)}; a {sensor.bits}-bit sensor has "
-                f"0..{sensor.levels - 1}; give the right --bits"
+                f"0..{sensor.levels - 1}; give the right bits="
             )
         return part
 
@@ -337,7 +337,7 @@ def windows_sensed(clip: Clip, light: Illumination, seed: int, centres: range) -
     `ValueError` for the clip's own light (`ppp` None), which has no level to bring a window to.
     """
     if light.ppp is None:
-        raise ValueError("the published protocol forces the exposure of every window; give --ppp")
+        raise ValueError("the published protocol forces the exposure of every window; give ppp=")
     clip.require_one_band("the published protocol")
     sensor = light.device(clip.exposure)
     for t in centres:

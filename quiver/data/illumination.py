@@ -36,7 +36,7 @@ LEVEL = (*ALWAYS, "lux")  # settings that the text of a light states in its own 
 HONOURED = (*LEVEL, "diffraction", "defects", "temperature", "pixel_pitch")
 # Settings of streams that `unlike_windows` knows by what they led to, or that change no law of the codes
 STATED = ("seed", "name", "group", "slices", "row_delay", "row_order", "exposures", "follow")
-OTHERS = "give --sensor, --bits and --ppp, in Python WindowSettings(lights=...)"  # where a stream's noise is of no use
+OTHERS = "give sensor=, bits= and ppp=, in Python WindowSettings(lights=...)"  # where a stream's noise is of no use
 LONGEST = 500  # characters of a stored name
 
 

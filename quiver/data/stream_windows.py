@@ -100,7 +100,7 @@ class StreamWindows(Dataset[dict[str, Any]]):
         if length < settings.frames or min(height, width) < settings.crop:
             raise ValueError(
                 f"{codes.name} is {length} x {height} x {width}; a window needs {settings.frames} frames of "
-                f"{settings.crop} x {settings.crop} px; choose a smaller --crop or fewer --frames"
+                f"{settings.crop} x {settings.crop} px; choose a smaller crop= or fewer frames="
             )
         law_of(codes)
         self.codes = codes

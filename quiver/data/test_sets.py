@@ -155,7 +155,7 @@ def _check_others(folder: Path, out: Path, names: set[str]) -> None:
     """Raise `ValueError` if OUT holds anything but clips of these names, finished or not: it would be scored along."""
     for item in sorted(out.iterdir()) if out.is_dir() else []:
         if not item.name.startswith(".") and not {item.name, item.name.removesuffix(".part")} & names:
-            raise ValueError(f"{item}: is no clip of {folder}; choose another -o")
+            raise ValueError(f"{item}: is no clip of {folder}; choose another")
 
 
 def _check_target(target: Path, info: ClipInfo) -> None:
@@ -169,10 +169,10 @@ def _check_target(target: Path, info: ClipInfo) -> None:
     if found == wanted and same:
         return
     if replace(found, sha256=wanted.sha256) == wanted and same:
-        raise ValueError(f"{target}: {wanted.file} was changed since it became this clip; choose another -o")
+        raise ValueError(f"{target}: {wanted.file} was changed since it became this clip; choose another")
     raise ValueError(
         f"{target}: is a clip of {found.file or 'another source'} with {len(clip)} frames, not of {wanted.file} with "
-        f"{info.shape[0]}; choose another -o"
+        f"{info.shape[0]}; choose another"
     )
 
 

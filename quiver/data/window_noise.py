@@ -52,18 +52,18 @@ def check_windows(noise: Illumination, clip: Clip) -> None:
     """Raise `ValueError` if windows of this clip cannot be drawn one by one with this noise."""
     draw = noise.draw(clip)
     if draw.remembers:
-        raise ValueError(f"{noise.sensor}: training windows cannot follow the charge of a spike camera; give --sensor")
+        raise ValueError(f"{noise.sensor}: training windows cannot follow the charge of a spike camera; give sensor=")
     if draw.diffraction and clip.camera is None:
         raise ValueError(
             f"{clip.name}: diffraction needs a camera, and this clip's radiance is relative (imported video); leave "
-            "its data set out, or sense the other clips without --diffraction"
+            "its data set out, or sense the other clips without diffraction=True"
         )
     if noise.defects is not None:
         array = _pixel_array(noise.defects, draw.plane, clip.shape[1:], draw.origin)
         if array.follows_photons:
             raise ValueError(
                 f"{noise.sensor}: carry_dead_time and afterpulse of counting pixels reach from exposure to exposure, "
-                "which training windows cannot follow; give --sensor with a file without them"
+                "which training windows cannot follow; give sensor= with a file without them"
             )
 
 

@@ -328,7 +328,7 @@ def check_clips(clips: Sequence[Clip], settings: WindowSettings) -> None:
         clip.require_one_band("training")
         length, height, width = clip.shape
         if length < settings.frames or min(height, width) < settings.crop:
-            less = "choose fewer --frames" if length < settings.frames else "choose a smaller --crop"
+            less = "choose fewer frames=" if length < settings.frames else "choose a smaller crop="
             longer = f"give clips of {settings.least} frames or more"
             advice = longer if length < settings.least else f"{less}, or other clips"
             raise ValueError(

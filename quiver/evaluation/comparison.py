@@ -22,7 +22,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import records
-from qsim.files import read_json, write_json
+from qsim.files import Blocked, read_json, write_json
 from quiver import threads
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import Codes, Stream, array_codes, sensed, stored, windows_sensed
@@ -200,7 +200,7 @@ def _middles(windows: Sequence[Codes], frames: range) -> Callable[[int, int], Ar
 def check(comparison: Comparison) -> list[Clip]:
     """Return the scored clips; `ValueError` if there are none, or if they or the lights do not fit the settings."""
     if comparison.stream is not None and (comparison.published or len(comparison.lights) > 1):
-        raise ValueError("a stored stream has one light level and one exposure; leave out --ppp and --published")
+        raise ValueError("a stored stream has one light level and one exposure; leave out ppp= and published=True")
     clips = clips_of(comparison)
     if not clips:
         raise ValueError(f"{comparison.source}: no finished clip in split {comparison.split!r}")
@@ -218,11 +218,11 @@ def check(comparison: Comparison) -> list[Clip]:
     for light in comparison.lights:
         if comparison.published and light.sensor.endswith(".toml") and read_sensor(light.sensor, light.bits)[1]:
             raise ValueError(
-                f"--published: draws windows without defects, and {light.sensor} has a table [defects]; leave it out"
+                f"published=True: draws windows without defects, and {light.sensor} has a table [defects]; leave it out"
             )
         if comparison.published and light.draw(clips[0]).remembers:
             raise ValueError(
-                f"--published: draws windows one by one, and the charge of a spike camera ({light.sensor}) stays "
+                f"published=True: draws windows one by one, and the charge of a spike camera ({light.sensor}) stays "
                 "between them; leave it out"
             )
     return clips
@@ -301,8 +301,8 @@ def check_folder(out: Path, comparison: Comparison, *, force: bool = False) -> N
     if out.is_dir() and all(path.name in allowed for path in out.iterdir()):
         return
     if force:
-        raise FileExistsError(f"{out} holds no plan.json; --force removes only what this command made")
-    raise FileExistsError(f"{out} exists and is not an evaluation; choose another -o")
+        raise FileExistsError(f"{out} holds no plan.json; only what this program made is removed")
+    raise FileExistsError(f"{out} exists and is not an evaluation; choose another")
 
 
 def begin(comparison: Comparison, out: Path, clips: Sequence[Clip]) -> list[ComparisonRow]:
@@ -317,5 +317,5 @@ def begin(comparison: Comparison, out: Path, clips: Sequence[Clip]) -> list[Comp
     elif (found := read_json(path)) != wanted:
         changed = found | content == wanted
         what = "rows of clips, streams or sensors that were changed since" if changed else "another evaluation"
-        raise FileExistsError(f"{out} holds {what}; choose another -o, or start again with --force")
+        raise Blocked(f"{out} holds {what}", "choose another folder, or start again with force=True")
     return stored_rows(out / "rows.jsonl")

@@ -267,9 +267,9 @@ def checked_cases(
     _check_known("precisions", precisions, ("float32", "bfloat16"))
     for option, value in (("modes", modes), ("precisions", precisions), ("device", device)):
         if value is not None and not networks:
-            raise ValueError(f"--{option}: acts on networks, and {', '.join(methods)} is classical; leave it out")
+            raise ValueError(f"{option}=: acts on networks, and {', '.join(methods)} is classical; leave it out")
     if modes is not None and networks and all(_has_one_mode(network) for network in networks):
-        raise ValueError(f"--modes: acts on QUIVER, {', '.join(networks)} has one mode; leave it out")
+        raise ValueError(f"modes=: acts on QUIVER, {', '.join(networks)} has one mode; leave it out")
     if networks:
         pick_device(device or "auto")
     return cases_of(methods, modes or ("exact", "streaming"), precisions or ("float32",))
@@ -279,7 +279,7 @@ def _check_known(option: str, given: Sequence[str] | None, known: Sequence[str])
     """Raise `ValueError` for a name that is none of the known ones."""
     for name in given or ():
         if name not in known:
-            raise ValueError(f"--{option}: no {name!r}{suggest(name, known)}; known are {', '.join(known)}")
+            raise ValueError(f"{option}=: no {name!r}{suggest(name, known)}; known are {', '.join(known)}")
 
 
 def device_of(cases: Sequence[CostCase], wanted: str | None) -> str:

@@ -105,7 +105,7 @@ def measure(
     if before is not None and changed and not force:
         raise ValueError(
             f"{weights}: holds {len(before.cells)} cells that were measured otherwise (not the same: "
-            f"{', '.join(changed)}); measure into a copy of the file, or use --force to replace them"
+            f"{', '.join(changed)}); measure into a copy of the file, or replace them with force=True"
         )
     todo = [light for light in settings.lights if force or not _known(weights, shared, light)]
     for done, light in enumerate(todo):

@@ -89,7 +89,7 @@ def above_peak_warning(what: str, share: float) -> str:
     """Return the warning of a table in which more than ABOVE_PEAK of the target lies above the peak."""
     return (
         f"Warning: {100 * share:.1f} % of the pixels of {what} lie above the peak, where the clamp hides errors. "
-        "A larger --peak counts them."
+        "A larger peak= counts them."
     )
 
 

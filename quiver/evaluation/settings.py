@@ -28,7 +28,7 @@ class EvaluateSettings:
     """Which methods are scored on which clips, in which light; or on the photon counts of a static object."""
 
     source: Annotated[
-        str | None, setting("data set or clip folder; with --protocol the folder of a test set", positional=True)
+        str | None, setting("data set or clip folder; with a protocol the folder of a test set", positional=True)
     ] = None
     output: Annotated[Path | None, setting("folder for evaluation.md, .json, .png (needed for clips)", short="o")] = (
         None
@@ -47,7 +47,7 @@ class EvaluateSettings:
     ] = None
     sensor: Annotated[
         Text | None,
-        setting("a name of `qsim doctor --devices`, or a .toml file", unset="quiver-physical", known=sensor_names),
+        setting("a name of `qsim sensors`, or a .toml file", unset="quiver-physical", known=sensor_names),
     ] = None
     ppp: Annotated[
         tuple[Light, ...] | None,

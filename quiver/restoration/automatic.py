@@ -43,7 +43,7 @@ def chosen_for_all(
         lines.append(f"auto: {best}; {why}")
     if len(streams_of) > 1:
         found = "; ".join(f"{best} for {_listed(names)}" for best, names in streams_of.items())
-        raise ValueError(f"auto chooses different methods: {found}; name one of them with --method")
+        raise ValueError(f"auto chooses different methods: {found}; name one of them with method=")
     best = next(iter(streams_of))
     return known.get(best) or restorer(best, options), lines[0]
 

@@ -190,7 +190,7 @@ def read_scope(path: Path, metadata: Mapping[str, str]) -> Scope:
     try:
         domain = None if text is None else Domain.from_json(text)
     except ValueError as error:
-        advice = "measure it again with `quiver domain --force`"
+        advice = "measure it again with force=True"
         raise ValueError(f"{path}: its domain is damaged ({error}); {advice}") from None
     return Scope(domain, _trained(metadata.get("settings")), bool(metadata.get("converted_from")))
 

@@ -115,7 +115,7 @@ def cores(height: int, width: int, pixels: int, reach: int, multiple: int, least
     if most_y[y] * most_x[x] > pixels:
         raise ValueError(
             f"the memory bound holds {pixels} pixels at a time; a tile needs at least {most_y.min()} x {most_x.min()}; "
-            "raise --memory"
+            "raise memory="
         )
     return int(tall[y]), int(wide[x])
 
@@ -304,7 +304,7 @@ def told_of_cut(codes: Codes, pieces: Pieces, apart: Disagreement) -> str | None
     if pieces.exact:
         return None
     rms, most = apart.measured()
-    more = f"; --memory {-(-pieces.needed // 10**6)}MB avoids the cut" if pieces.needed else ""
+    more = f"; memory={-(-pieces.needed // 10**6)}MB avoids the cut" if pieces.needed else ""
     return (
         f"{codes.name}: {pieces.memory / 1e6:.0f} MB hold no frame of {codes.shape[1]} x {codes.shape[2]} px; it is "
         f"cut into {pieces.text}, which differ where they overlap by {100 * rms:.2g} % of white rms, "

@@ -141,7 +141,7 @@ def _only_writer(path: Path) -> Iterator[None]:
     """Hold PATH.npy.lock and delete it at the end. `ValueError` if another process holds it."""
     lock = Lock(path.with_name(path.name + ".lock"))
     if not lock.acquire():
-        raise ValueError(f"{path}: another process is writing this video; wait for it, or name another with -o")
+        raise ValueError(f"{path}: another process is writing this video; wait for it, or name another")
     try:
         yield
     finally:
@@ -178,19 +178,18 @@ def _complete(journal: Path) -> bool:
 def _check_target(path: Path, journal: Path, force: bool) -> None:
     """Raise `FileExistsError` if there is a file that may not be replaced."""
     if path.is_dir():
-        raise FileExistsError(f"{path}: is a folder; name a file with -o")
+        raise FileExistsError(f"{path}: is a folder; name a file")
     for file in (path, path.with_suffix(".json")):
         if file.exists() and not force:
-            raise FileExistsError(f"{file}: exists; name another with -o, or use --force to replace it")
+            raise FileExistsError(f"{file}: exists; name another, or replace it with force=True")
     description = path.with_suffix(".json")
     if description.exists() and not describes_restored(read_json(description)):
         raise FileExistsError(
-            f"{description}: does not describe restored video, and --force replaces nothing else; name another with -o"
+            f"{description}: does not describe restored video, and nothing else is replaced; name another"
         )
     if path.exists() and not description.exists() and not _complete(journal):  # complete: killed while it replaced
         raise FileExistsError(
-            f"{path}: has no .json that describes restored video, and --force replaces nothing else; name another "
-            "with -o"
+            f"{path}: has no .json that describes restored video, and nothing else is replaced; name another"
         )
 
 
@@ -206,8 +205,7 @@ def _check_unfinished(part: Path, journal: Path) -> None:
         foreign.append(part)
     if foreign:
         raise FileExistsError(
-            f"{foreign[0]}: exists and is not an unfinished restoration of this program; move it away, or name another "
-            "with -o"
+            f"{foreign[0]}: exists and is not an unfinished restoration of this program; move it away, or name another"
         )
 
 
@@ -294,7 +292,7 @@ def _done(part: Path, journal: Path, wanted: VideoInfo) -> tuple[int, float, str
     now = wanted.identity
     if changed == ["identity"] and before | {"cut": now["cut"]} == now:
         cuts = [tiles or "none" for tiles in (before.get("cut"), now["cut"])]
-        return 0, 0.0, f"the tiles of a frame, by --memory and the device, were {cuts[0]} and are {cuts[1]} now"
+        return 0, 0.0, f"the tiles of a frame, by memory= and the device, were {cuts[0]} and are {cuts[1]} now"
     return 0, 0.0, f"{' and '.join(told) or 'its description'} changed since"
 
 

@@ -27,7 +27,7 @@ class RestoreSettings:
     source: Annotated[
         Path,
         setting(
-            "stream (.npy with its .json), clip folder, bare .npy array, or (with -o OUT.zip) cubes of the challenge",
+            "stream (.npy with its .json), clip folder, bare .npy array, or (for a .zip) cubes of the challenge",
             positional=True,
         ),
     ]
@@ -49,7 +49,7 @@ class RestoreSettings:
     stream: Annotated[Text | None, setting("stream of a clip to restore", unset="the only one")] = None
     sensor: Annotated[
         Text | None,
-        setting("a name of `qsim doctor --devices`, or a .toml file", unset="quiver-physical", known=sensor_names),
+        setting("a name of `qsim sensors`, or a .toml file", unset="quiver-physical", known=sensor_names),
     ] = None
     ppp: Annotated[Light | None, setting("mean photons per pixel and exposure", unset="that of the stored stream")] = (
         None

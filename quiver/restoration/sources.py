@@ -93,10 +93,10 @@ def _of_clip(path: Path, asked: RestoreSettings) -> Codes:
     refuse(asked, BARE, f"describes a bare array, and {path} is a clip")
     if asked.ppp is None and asked.stream is None and len(clip.streams) != 1:
         there = ", ".join(clip.streams) or "none"
-        raise ValueError(f"{path}: choose one of its streams with --stream ({there}), or sense it now with --ppp")
+        raise ValueError(f"{path}: choose one of its streams with stream= ({there}), or sense it now with ppp=")
     if asked.stream is not None or asked.ppp is None:
         stream = clip.stream(asked.stream or clip.streams[0])
-        now = "" if asked.stream else " (with --ppp the clip is sensed again)"
+        now = "" if asked.stream else " (with ppp= the clip is sensed again)"
         refuse(asked, LIGHT, f"{stream.path} is a stored stream, which has its own{now}")
         return stream_codes(stream)
     return sensed(clip, Illumination.of(_sensor(asked), asked.ppp, _bits(asked)), asked.seed or 0)[0]
@@ -109,7 +109,7 @@ def _of_array(path: Path, asked: RestoreSettings) -> Codes:
         refuse(asked, ["ppp"], f"{path} holds codes already, and the gain of {sensor} does not follow the light")
     light = Illumination.of(sensor, asked.ppp, asked.bits if asked.width is not None else _bits(asked))
     if asked.output.resolve() == path.resolve():
-        raise ValueError(f"{path}: would be replaced by what is made from it; name another with -o")
+        raise ValueError(f"{path}: would be replaced by what is made from it; name another")
     codes = cube_codes(path, light, asked.frame_rate or FRAME_RATE, planes=asked.planes, width=asked.width)
     if not sensor.endswith(".toml"):
         return codes

@@ -120,12 +120,12 @@ def check_target(path: Path, force: bool) -> None:
     description = path.with_suffix(".json")
     for file in (path, description):
         if (file.exists() or file.is_symlink()) and not force:
-            raise FileExistsError(f"{file}: exists; name another with -o, or use --force to replace it")
+            raise FileExistsError(f"{file}: exists; name another, or replace it with force=True")
     there = path.exists() or path.is_symlink() or description.exists()
     ours = description.is_file() and files.read_json(description).get("format") == SubmissionInfo.FORMAT
     if there and (not ours or path.is_dir() or path.is_symlink()):
         raise FileExistsError(
-            f"{path}: is not a submission with its .json, which is all that --force replaces; name another with -o"
+            f"{path}: is not a submission with its .json, which is all that is replaced; name another"
         )
 
 

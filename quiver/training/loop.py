@@ -49,7 +49,11 @@ VALIDATION_SIDE = 128  # px, of the validation windows at most
 
 
 class Diverged(RuntimeError):
-    """The loss or a gradient is NaN or Inf; the message names the step, the samples and the saved state."""
+    """The loss or a gradient is NaN or Inf: `problem` names the step, the samples and the saved state."""
+
+    def __init__(self, problem: str, cure: str = "lower the learning rate and start again with force=True") -> None:
+        super().__init__(f"{problem}; {cure}")
+        self.problem = problem
 
 
 def make_windows(
@@ -241,8 +245,7 @@ class Trainer:
         self.run.save(path, self.model, self.optimiser, self.state, samples=samples, keys=list(batch["key"]))
         raise Diverged(
             f"step {self.state.step}: loss {self.loss:g}, gradient norm {norm:g}; samples {samples} "
-            f"({batch['key'][0]}; ...); state before the step: {path}; lower the learning rate and start again with "
-            "--force"
+            f"({batch['key'][0]}; ...); state before the step: {path}"
         )
 
     def validate_if_due(self) -> None:

@@ -43,7 +43,7 @@ PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
 def check(network: nn.Module, settings: Settings) -> None:
     """Raise `ValueError` unless windows have the frames that a restored frame is merged from."""
     if settings.frames != WINDOW:
-        raise ValueError(f"--frames {settings.frames}: mergenet restores from {WINDOW} frames; leave --frames out")
+        raise ValueError(f"frames={settings.frames}: mergenet restores from {WINDOW} frames; leave frames= out")
 
 
 def prepare(codes: Codes) -> dict[str, Tensor]:

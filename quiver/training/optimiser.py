@@ -37,7 +37,7 @@ class Optimiser:
         self.parts: list[torch.optim.Optimizer] = [torch.optim.Adam(rest, lr=rate, betas=betas, eps=1e-8)]
         if self.matrices:
             if not hasattr(torch.optim, "Muon"):
-                raise ValueError(f"Muon needs torch 2.9 or newer, this is {torch.__version__}; choose --optimiser adam")
+                raise ValueError(f"Muon needs torch 2.9 or newer, this is {torch.__version__}; choose optimiser=adam")
             muon = torch.optim.Muon(self.matrices, lr=rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
             self.parts.append(muon)
 

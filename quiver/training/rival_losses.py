@@ -130,7 +130,7 @@ def check_flornn(network: Any, settings: Settings) -> None:
     least = network.look_ahead + (2 if network.config.as_published else 1)
     if settings.frames < least:
         raise ValueError(
-            f"--frames {settings.frames}: with a look-ahead of {network.look_ahead} frames FloRNN needs {least}"
+            f"frames={settings.frames}: with a look-ahead of {network.look_ahead} frames FloRNN needs {least}"
         )
     if network.flow is None:
         raise ValueError("this FloRNN has no flow network, and clips give none; set FloRNNConfig.flow_channels")
@@ -158,8 +158,8 @@ def check_memdeblur(network: Any, settings: Settings) -> None:
     """
     if settings.batch < FEWEST and settings.crop <= 64 and not network.config.group_norm:
         raise ValueError(
-            f"--batch {settings.batch} with --crop {settings.crop}: batch normalisation of MemDeblur needs {FEWEST} "
-            f"windows or crops above 64 px; give --batch {FEWEST}"
+            f"batch={settings.batch} with crop={settings.crop}: batch normalisation of MemDeblur needs {FEWEST} "
+            f"windows or crops above 64 px; give batch={FEWEST}"
         )
 
 
@@ -176,7 +176,7 @@ def student_begins(network: Any) -> float:
 def check_student_teacher(network: nn.Module, settings: Settings) -> None:
     """Raise `ValueError` for windows of more frames than teachers and student see."""
     if settings.frames != WINDOW:
-        raise ValueError(f"--frames {settings.frames}: student-teacher learns from {WINDOW} frames; leave --frames out")
+        raise ValueError(f"frames={settings.frames}: student-teacher learns from {WINDOW} frames; leave frames= out")
 
 
 def student_teacher_loss(network: Any, batch: Batch, settings: Settings, share: float) -> Tensor:

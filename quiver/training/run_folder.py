@@ -22,7 +22,7 @@ import torch
 from torch import nn
 
 from qsim.figures import new_figure, write_figure
-from qsim.files import check_ours, read_json, write_bytes, write_json
+from qsim.files import Blocked, Damaged, check_ours, read_json, write_bytes, write_json
 from qsim.locks import Lock
 from quiver.device import random_states, set_random_states
 from quiver.evaluation.json_values import json_safe
@@ -69,7 +69,7 @@ def alone_in(folder: Path, doing: str) -> Iterator[None]:
     """Hold the lock of a folder of results; `ValueError` if another process holds it."""
     lock = Lock(folder / LOCK)
     if not lock.acquire():
-        raise ValueError(f"{folder}: another process {doing} here; wait for it to end, or choose another -o")
+        raise ValueError(f"{folder}: another process {doing} here; wait for it to end, or choose another folder")
     try:
         yield
     finally:
@@ -123,8 +123,8 @@ class Run:
             return
         if not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir()):
             if force:
-                raise FileExistsError(f"{folder} holds no settings.json; --force removes only what this command made")
-            raise FileExistsError(f"{folder} exists and is not a training run; choose another -o")
+                raise FileExistsError(f"{folder} holds no settings.json; only what this program made is removed")
+            raise FileExistsError(f"{folder} exists and is not a training run; choose another")
 
     def _check_settings(self) -> None:
         wanted = self.settings.to_dict()
@@ -133,16 +133,16 @@ class Run:
         for name in wanted:
             if name not in free and _alone(found.get(name)) != _alone(wanted[name]):
                 before = "as in its data set" if found.get(name) is None else short(found[name])
-                raise FileExistsError(
-                    f"{self.folder} holds a run with {name} {before}, now it is {short(wanted[name])}; choose "
-                    "another -o, or start again with --force"
+                raise Blocked(
+                    f"{self.folder} holds a run with {name} {before}, now it is {short(wanted[name])}",
+                    "choose another folder, or start again with force=True",
                 )
         for name, value in self.conditions.items():
             begun = found.get(name)
             if begun != value:
-                raise FileExistsError(
-                    f"{self.folder} {CONDITIONS[name].format(short(begun), short(value))}; resume it as it began, "
-                    "choose another -o, or start again with --force"
+                raise Blocked(
+                    f"{self.folder} {CONDITIONS[name].format(short(begun), short(value))}",
+                    "resume it as it began, choose another folder, or start again with force=True",
                 )
 
     def save(self, path: Path, model: nn.Module, optimiser: Optimiser, state: State, **extra: Any) -> None:
@@ -175,8 +175,9 @@ class Run:
             set_random_states(content["cuda_rng"])
             return state
         except weights.DAMAGE as error:
-            raise ValueError(
-                f"{self.checkpoint}: not a state of this run ({weights.short_reason(error)}); start again with --force"
+            raise Damaged(
+                f"{self.checkpoint}: not a state of this run ({weights.short_reason(error)})",
+                "start again with force=True",
             ) from None
 
     def save_weights(self, name: str, model: nn.Module, state: State) -> None:

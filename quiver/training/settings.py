@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from qsim import records
-from qsim.files import read_json
+from qsim.files import Blocked, Damaged, read_json
 from qsim.kinds import Bits, Count, Light, Number, Positive, Seed, Split, Text, Whole
 from qsim.settings import setting
 from qsim.words import positive_numbers
@@ -68,7 +68,7 @@ class Settings:
     sensor: Annotated[
         str | tuple[Text, ...] | None,
         setting(
-            "names of `qsim doctor --devices` or .toml files, comma-separated",
+            "names of `qsim sensors` or .toml files, comma-separated",
             unset="the protocol's, which mergenet states, else those of the data set's streams",
             known=sensor_names,
         ),
@@ -206,12 +206,12 @@ def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[
         noise = _recorded(found)
         told = replace(settings, **asked, noise=noise, threads=settings.threads or threads.recorded(path))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}; the file is damaged, start again with --force") from None
+        raise Damaged(f"{path}: {error}; the file is damaged", "start again with force=True") from None
     files = tuple(name for name in settings.sensors or () if name.endswith(".toml"))
     if files and _of_files(mixture.noises) != _of_files(noise):
-        raise FileExistsError(
-            f"{settings.out} holds a run with noise: {describe(noise)}; {', '.join(files)} now describes other noise; "
-            "choose another -o, or start again with --force"
+        raise Blocked(
+            f"{settings.out} holds a run with noise: {describe(noise)}; {', '.join(files)} now describes other noise",
+            "choose another folder, or start again with force=True",
         )
     return told, Mixture(noise, "as this run began", mixture.streams).lines
 

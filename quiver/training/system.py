@@ -64,19 +64,19 @@ class System:
         least = self.window(network)
         multiple = self.side(network)
         if settings.frames < least:
-            raise ValueError(f"--frames must be at least {least}, the window of {self.name}, got {settings.frames}")
+            raise ValueError(f"frames= must be at least {least}, the window of {self.name}, got {settings.frames}")
         if settings.crop % multiple:
-            raise ValueError(f"--crop {settings.crop}: this network needs a multiple of {multiple}")
+            raise ValueError(f"crop={settings.crop}: this network needs a multiple of {multiple}")
         if settings.loss not in self.losses:
             raise ValueError(
-                f"--loss {settings.loss}: {self.name} is trained with {' or '.join(self.losses)}; leave --loss out"
+                f"loss={settings.loss}: {self.name} is trained with {' or '.join(self.losses)}; leave loss= out"
             )
         if self.of_stream and settings.schedule == "plateau":
-            raise ValueError(f"--schedule plateau: follows validations, and {self.name} has none; leave it out")
+            raise ValueError(f"schedule=plateau: follows validations, and {self.name} has none; leave it out")
         if settings.schedule == "plateau" and settings.steps is None:
             raise ValueError(
-                "--schedule plateau: a run that --minutes ends has ten validations, too few for it; give "
-                "--steps, or leave it out"
+                "schedule=plateau: a run that minutes= ends has ten validations, too few for it; give "
+                "steps=, or leave it out"
             )
         self.check(network, settings)
 
@@ -98,5 +98,5 @@ class Objective(nn.Module):
 def protocol(system: System, name: str) -> Mapping[str, Any]:
     """Return the settings of a protocol; `ValueError` if the system has none of that name."""
     if name not in system.protocols:
-        raise ValueError(f"--protocol {name}: {system.name} has {' and '.join(system.protocols)}; choose one of them")
+        raise ValueError(f"protocol={name}: {system.name} has {' and '.join(system.protocols)}; choose one of them")
     return system.protocols[name]

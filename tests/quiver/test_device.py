@@ -19,7 +19,7 @@ def test_auto_is_a_gpu_where_there_is_one(monkeypatch):
         monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
         assert device.pick_device("auto") == kind
         assert device.pick_device("cpu") == "cpu"
-    with pytest.raises(ValueError, match="--device cuda: torch finds no CUDA device here; use --device cpu"):
+    with pytest.raises(ValueError, match="device=cuda: torch finds no CUDA device here; use device=cpu"):
         device.pick_device("cuda")
 
 

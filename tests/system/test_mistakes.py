@@ -72,7 +72,7 @@ MISTAKES = [
     ("qsim render short.glb -o x", "short.glb: 4 bytes are no .glb file; it is truncated"),
     ("qsim render rest.gltf -o x", "rest.gltf: has no animation; use shapes.mesh_file for a mesh that keeps its shape"),
     ("qsim generate body.toml -o x", "short.glb: 4 bytes are no .glb file; it is truncated"),
-    ("qsim render fan -o lit", "lit: exists; name another with -o, or use --force"),
+    ("qsim render fan -o lit", "lit: exists; name another, or replace it with --force"),
     ("qsim validate render --scenes fann", "did you mean 'fan'?"),
     ("qsim render good.toml -o x", "good.toml: is a recipe of a data set, not a scene; use `qsim generate good.toml`"),
     ("qsim plan fan", "fan: is a scene family, not a recipe; use `qsim render fan`"),
@@ -166,8 +166,8 @@ MISTAKES = [
     ("qsim convert lit x.npz", "lit: a clip has light, and no single photons; name one of its streams"),
     ("qsim compare lit --span 1", "has no streams to compare; make some with `qsim sense`"),
     # What is in the way
-    ("qsim render fan -o text.txt --force", "text.txt: exists and is not a clip, which is all that --force replaces"),
-    ("qsim render fan -o data --force", "data: exists and is not a clip, which is all that --force replaces"),
+    ("qsim render fan -o text.txt --force", "text.txt: exists and is not a clip, which is all that is replaced"),
+    ("qsim render fan -o data --force", "data: exists and is not a clip, which is all that is replaced"),
     (
         "qsim convert light.npy data --force --frame-rate 2000 --exposure 1e-4 --transfer linear",
         "data: exists and is no",
@@ -233,7 +233,7 @@ MISTAKES = [
     ("qsim convert flat.npy x --frame-rate 9", "flat.npy: expected frames [T, H, W], found an array of shape [8, 10]"),
     ("qsim convert norows.npy x --frame-rate 9", "norows.npy: frames of 0 x 10 pixels"),
     ("qsim convert objects.npy x --frame-rate 9", "objects.npy: not readable as .npy"),
-    ("qsim convert text.txt x --frame-rate 9", "text.txt: unknown kind of file; name it with `qsim convert"),
+    ("qsim convert text.txt x --frame-rate 9", "text.txt: unknown kind of file; name its --layout: cube"),
     ("qsim convert broken.png x --frame-rate 9 --transfer srgb", "broken.png: not readable as PNG"),
     ("qsim convert grey.png x --frame-rate 9", "a picture does not state its transfer curve; add --transfer 'linear'"),
     ("qsim convert odd.bin x --frame-rate 9 --layout swissspad2-half", "1001 bytes are not a whole number of"),
@@ -267,11 +267,11 @@ MISTAKES = [
     ("qsim preview data", "data: is a data set; name one of its clips, as in data/clips/NAME"),
     ("qsim preview codes.npy", "whole numbers are codes or packed planes; add --bits 3"),
     ("qsim tradeoff", "give a clip or a scene, --table, or --paper-figure"),
-    ("qsim tradeoff lit", "lit: 2000 fps; this study needs a clip of at least 10000 fps, as in `qsim render fan"),
+    ("qsim tradeoff lit", "lit: 2000 fps; this study needs a clip of at least 10000 fps, as in `qsim render`"),
     ("qsim tradeoff --paper-figure 3 -o x", "--paper-figure: expected one of 1, 2, got '3'"),
     ("qsim calibrate --bits 3 -o x.txt", "x.txt: the sensor file is a .toml, as in -o my_sensor.toml"),
     ("qsim calibrate --bits 3 --dark codes.npy -o x.toml", "give a file and its exposure in seconds, as in --dark"),
-    ("qsim calibrate --bits 3 --dark text.txt 1 -o x.toml", "text.txt: unknown kind of file; name it with `qsim conv"),
+    ("qsim calibrate --bits 3 --dark text.txt 1 -o x.toml", "text.txt: unknown kind of file; name its --layout: cube"),
     ("qsim tradeoff --paper-figure 1 -o text.txt", "text.txt: is a file where a folder is needed"),
     (
         "qsim calibrate --bits 99 --dark codes.npy 1e-3 -o x.toml",
@@ -286,7 +286,7 @@ MISTAKES = [
     ("quiver domain moment", "moment: a classical method has no weights; name mergenet, a .safetensors file or"),
     ("quiver train data -o x --steps 1 --start qbp", "qbp: a classical method has no weights; name mergenet, a"),
     ("quiver restore lit -o x.mp4", "x.mp4: restored video is written as .npy"),
-    ("quiver restore lit -o light.npy --ppp 3", "light.npy: exists; name another with -o, or use --force"),
+    ("quiver restore lit -o light.npy --ppp 3", "light.npy: exists; name another, or replace it with --force"),
     ("quiver restore lit -o x.npy --ppp 3 --method momment", "no method 'momment' (did you mean 'moment'?)"),
     ("quiver restore lit -o x.npy --ppp 3 --method moment:x", "the window after the colon is a number of frames"),
     ("quiver restore lit -o x.npy --ppp 3 --method none.safetensors", "none.safetensors: no such weights file"),
@@ -473,7 +473,7 @@ def test_a_folder_that_is_not_ours(folder, monkeypatch, capsys, line, work):
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "empty")
     said = told(capsys, line)
     assert "no permission to write into " in said
-    assert "empty; name another with -o" in said
+    assert "empty; name another" in said
 
 
 def test_no_gpu(folder, monkeypatch, capsys):

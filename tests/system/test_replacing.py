@@ -141,7 +141,7 @@ def test_an_export_replaces_only_an_export(tmp_path: Path, kind: str):
     target.unlink()
     for force in (False, True, True):
         exporting.export(source, target, Export(kind), force=force)
-    with pytest.raises(FileExistsError, match="use --force"):
+    with pytest.raises(FileExistsError, match="force=True"):
         exporting.export(source, target, Export(kind))
 
 

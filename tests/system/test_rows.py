@@ -21,7 +21,7 @@ import restorer_tuned  # noqa: E402
 import reuse_rows  # noqa: E402
 import rows  # noqa: E402
 
-from quiver.cli.program import parser  # noqa: E402
+from quiver.cli.program import PROGRAM  # noqa: E402
 from quiver.evaluation.cost import checked_cases  # noqa: E402
 
 
@@ -85,7 +85,9 @@ def test_costs_are_asked_for_as_the_command_takes_them(tmp_path, monkeypatch, me
     """Networks with one mode refuse --modes; of QUIVER the first cost is that of the mode exact."""
 
     def asked(*words: object, budget: rows.Budget) -> None:
-        args = parser().parse_args([str(word) for word in words])
+        command, values = PROGRAM.read([str(word) for word in words])
+        assert command is not None
+        args = command.arguments(values)[0]
         first = checked_cases(args.methods, args.modes, args.precisions, args.device)[0]
         assert first.mode == "exact"
         rows.write_json(tmp_path / "bench.json", {"costs": [{"gmac_per_frame": 1.0, "method": first.method}]})

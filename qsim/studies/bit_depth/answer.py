@@ -62,11 +62,11 @@ def speed_for(px: float, motion: Callable[[float], float], name: str) -> tuple[f
             break
         speed = after
     if max(tried.values()) == 0:
-        raise ValueError(f"{name}: nothing in it moves, so --px {px:g} cannot be reached; leave --px out")
+        raise ValueError(f"{name}: nothing in it moves, so px={px:g} cannot be reached; leave px= out")
     best = min(tried, key=lambda v: abs(tried[v] - px))
     if abs(tried[best] / px - 1) > NEAR:
         raise ValueError(
-            f"{name}: --px {px:g} cannot be reached; speed factor {best:.4g} gives {tried[best]:.3g} px per "
+            f"{name}: px={px:g} cannot be reached; speed factor {best:.4g} gives {tried[best]:.3g} px per "
             f"{CODE_BITS}-bit frame, the nearest of {low:g} to {high:g}"
         )
     return float(f"{best:.4g}"), tried[best]
@@ -78,7 +78,7 @@ def step_for(px: float, clip: Clip) -> tuple[int, float]:
     Raise `ValueError` if the clip has no ground truth, is still, or moves faster already.
     """
     if not clip.has_truth:
-        raise ValueError(f"{clip.path}: has no ground truth, so its motion is unknown; give --speed instead of --px")
+        raise ValueError(f"{clip.path}: has no ground truth, so its motion is unknown; give speed= instead of px=")
     motions: dict[int, float] = {}
 
     def at(step: int) -> float:
@@ -87,10 +87,10 @@ def step_for(px: float, clip: Clip) -> tuple[int, float]:
         return motions[step]
 
     if at(max(1, len(clip))) == 0:
-        raise ValueError(f"{clip.path}: nothing in it moves, so --px {px:g} cannot be reached; leave --px out")
+        raise ValueError(f"{clip.path}: nothing in it moves, so px={px:g} cannot be reached; leave px= out")
     if at(1) > 1.5 * px:
         raise ValueError(
-            f"{clip.path}: moves {at(1):.3g} px per {CODE_BITS}-bit frame, and a clip can only be made faster; --px "
+            f"{clip.path}: moves {at(1):.3g} px per {CODE_BITS}-bit frame, and a clip can only be made faster; px="
             f"{px:g} needs a scene, or a clip at a higher frame rate"
         )
     guess = max(1, round(px / at(1))) if at(1) > 0 else len(clip)
@@ -154,7 +154,7 @@ def _of_model(found: Study, model: str) -> str:
     text = f"{model} {marked(found, model)} bit{'s' if best.bits > 1 else ''}{worse}"
     if edge == ">=":
         text += " (the deepest tried"
-        text += f": try --bits 1,...,{min(best.bits + 2, 10)})" if best.bits < 10 else ")"
+        text += f": try bits=1,...,{min(best.bits + 2, 10)})" if best.bits < 10 else ")"
     if edge == "<=":
-        text += " (the shallowest tried: try --bits 1,...)"
+        text += " (the shallowest tried: try bits=1,...)"
     return text

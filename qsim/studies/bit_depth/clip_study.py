@@ -103,7 +103,7 @@ def check_clip(clip: Clip, settings: StudySettings) -> None:
     if clip.frame_rate < SLOWEST:
         raise ValueError(
             f"{clip.path}: {clip.frame_rate:g} fps; this study needs a clip of at least {SLOWEST:g} fps, as in "
-            "`qsim render fan --frame-rate 10000`"
+            "`qsim render` with frame_rate=10000"
         )
     if len(clip) < settings.longest:
         raise ValueError(
@@ -234,7 +234,7 @@ def study(clip: Clip, settings: StudySettings, *, progress: Callable[[int, int],
     if not pixels:
         raise ValueError(
             f"{clip.path}: no pixel moves at its frames {', '.join(map(str, centres))}, which would be scored; give "
-            "more --instants, or --speed instead of --px to score all pixels"
+            "more instants=, or speed= instead of px= to score all pixels"
         )
     law = Structure(structure / pixels)
     motion = mean_motion(clip, settings.speed)

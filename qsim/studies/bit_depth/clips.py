@@ -61,11 +61,10 @@ def render(name: str, path: Path, shape: ClipShape, *, speed: float = 1.0, progr
         wanted = SceneName(family=scene.name, seed=scene.seed, speed=scene.speed)
         same = clip.shape == (shape.frames, shape.height, shape.width) and clip.frame_rate == shape.frame_rate
         if not same or clip.info.scene != wanted:
-            raise FileExistsError(f"{path}: exists and is another clip; name another folder with -o")
+            raise FileExistsError(f"{path}: exists and is another clip; name another folder")
         if clip.info.reads != read:
             raise FileExistsError(
-                f"{path}: exists and is not known to be of {name} and its files as they are now; name another folder "
-                "with -o"
+                f"{path}: exists and is not known to be of {name} and its files as they are now; name another folder"
             )
         return clip
     frames = shape.frames
@@ -99,7 +98,7 @@ def clips_for(
             f"{source}: neither a clip folder nor a scene; the scenes are {', '.join(scenes.FAMILIES)}"
         )
     if folder is None:
-        raise ValueError(f"{source} is a scene: give a folder for its clip with -o")
+        raise ValueError(f"{source} is a scene: give a folder for its clip")
     paths = {v: clip_path(folder, source, v) for v in speeds}
     missing = [v for v, path in paths.items() if not (path / "clip.json").is_file()]
 

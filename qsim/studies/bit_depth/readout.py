@@ -138,7 +138,7 @@ def at_depth(name: str, bits: int, ppp: float, exposure: float, temperature: flo
     if sensor.bits != bits:
         raise ValueError(
             f"{name}: its gain and offset belong to its {sensor.bits} bits, and {bits} are asked for; give a QIS of "
-            f"gain 1 without offset, a SPAD, or for --sensor its own depth alone: --bits {sensor.bits}"
+            f"gain 1 without offset, a SPAD, or for sensor= its own depth alone: bits={sensor.bits}"
         )
     return sensor
 
@@ -181,7 +181,7 @@ def plane_sensor(settings: StudySettings, ppp: float, exposure: float) -> Sensor
     if read.dark_rate != longer.dark_rate:
         raise ValueError(
             f"{settings.sensor}: its dark electrons are per frame, whatever the exposure, so that planes have no dark "
-            "rate; name their sensor with --plane-sensor, or take quiver-physical"
+            "rate; name their sensor with plane_sensor=, or take quiver-physical"
         )
     return BinarySPAD(read.efficiency, read.dark_rate, 1)
 

@@ -113,7 +113,7 @@ def test_one_frame_is_refused_with_the_cure():
 
 
 def test_flats_darker_than_the_darks_are_refused():
-    with pytest.raises(ValueError, match="are --dark and --flat swapped"):
+    with pytest.raises(ValueError, match="are dark and flat frames swapped"):
         calibrate_qis([statistics_of(noise(top=8))], [statistics_of(noise(top=3), photons=None)], bits=3)
 
 

@@ -67,7 +67,7 @@ def test_planes_of_a_stream_need_no_width(tmp_path):
     for width in (None, 11):
         found = read_stack(one.path, bits=1, exposure=5e-4, photons=None, hints=Hints(width=width))
         assert np.array_equal(found.total, one.codes().sum(axis=0, dtype=float))
-    with pytest.raises(ValueError, match="is a stream of 11 pixels per row, not 12; leave --width out"):
+    with pytest.raises(ValueError, match="is a stream of 11 pixels per row, not 12; leave width= out"):
         read_stack(one.path, bits=1, exposure=5e-4, photons=None, hints=Hints(width=12))
     found = read_stack(sums.path, bits=1, exposure=5e-4, photons=None, planes=3)
     assert (found.frames, found.mean) == (9, pytest.approx(sums.codes().mean() / 3))
@@ -92,7 +92,7 @@ def test_photon_times_are_calibrated_as_the_counts_of_their_pixels(tmp_path):
         (1e-3, {"bits": 8}, "an exposure of 0.001 s; the photon times state 0.0005 s, give that"),
         (5e-4, {"bits": 1, "planes": 50}, "an exposure of 0.0005 s; the photon times state 1e-05 s, give that"),
         (5e-4 / 300, {"bits": 1, "planes": 300}, "of photon times sums of at most 255 are made"),
-        (5e-4, {"bits": 1, "hints": Hints(width=7)}, "--width changes nothing for photon times; leave it out"),
+        (5e-4, {"bits": 1, "hints": Hints(width=7)}, "width= changes nothing for photon times; leave it out"),
     ):
         with pytest.raises(ValueError, match=message):
             read_stack(path, exposure=seconds, photons=None, **more)

@@ -207,7 +207,7 @@ def test_files_beside_the_sensor_file_are_replaced_with_force_only(folder, capsy
     words = "calibrate --model spad --bits 1 --dark dark_planes.npy 1e-5 --flat flat_planes.npy 1e-5 0.9 -o a.toml"
     before = contents(folder)
     assert main(words.split()) == 2
-    assert f"{name}: exists; name another with -o, or use --force to replace it" in capsys.readouterr().err
+    assert f"{name}: exists; name another, or replace it with --force" in capsys.readouterr().err
     assert contents(folder) == before
     assert main([*words.split(), "--force"]) == 0
     assert Path(name).stat().st_size > 0

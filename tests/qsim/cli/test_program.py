@@ -162,7 +162,7 @@ def test_sensing_is_idempotent_and_never_overwrites_silently(made: Path, capsys:
     assert (clip / "streams" / "mine.npy").stat().st_mtime_ns == first
     code, _, err = run(capsys, *arguments, "--seed", 1)
     assert code == 2
-    assert "exists with other settings; name this stream with --name, or use --force" in err
+    assert "exists with other settings; give the stream a --name, or replace it with --force" in err
     old = Clip.open(clip).stream("mine").codes()
     assert run(capsys, *arguments, "--seed", 1, "--force")[0] == 0
     assert (Clip.open(clip).stream("mine").codes() != old).any()

@@ -64,7 +64,7 @@ def test_streams_are_replaced_with_force_and_refused_before_the_study_without(cl
     monkeypatch.setattr(clip_study, "study", lambda *_, **__: pytest.fail("was studied first"))
     capsys.readouterr()
     assert main(words) == 2
-    assert "wave_1bit: exists; name another with -o, or use --force to replace it" in capsys.readouterr().err
+    assert "wave_1bit: exists; name another, or replace it with --force" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

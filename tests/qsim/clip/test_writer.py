@@ -143,7 +143,7 @@ def test_two_writers_of_one_clip(tmp_path: Path):
 
 def test_nothing_is_overwritten_without_force(tmp_path: Path):
     write(tmp_path / "a")
-    with pytest.raises(FileExistsError, match="--force"):
+    with pytest.raises(FileExistsError, match="force=True"):
         ClipWriter(tmp_path / "a", meta())
     with ClipWriter(tmp_path / "a", meta(), force=True) as writer:
         for t in range(FRAMES):

@@ -71,7 +71,7 @@ def test_visionsim_folders(tmp_path: Path, width: int, sharded: bool):
         np.save(tmp_path / "frames.npy", packed)
     info = {"w": width, "h": 5, "c": 3, "bitpack": True, "bitpack_dim": 2}
     (tmp_path / "transforms.json").write_text(json.dumps(info))
-    with pytest.raises(ValueError, match="3 colour planes; choose one with --channel"):
+    with pytest.raises(ValueError, match="3 colour planes; choose one with channel="):
         importing.read(tmp_path)
     for channel in range(3):
         np.testing.assert_array_equal(everything(tmp_path, channel=channel), expected[..., channel])
@@ -93,7 +93,7 @@ def test_sums_of_visionsim_are_those_of_a_clocked_sensor(tmp_path: Path):
         (5, {}, None),
         (0, {}, "sums of 0 bitplanes"),
         (2**17 - 1, {}, "sums of 131071 bitplanes"),
-        (7, {"bits": 4}, "sums of 7 bitplanes have 3 bits, not 4; leave --bits out"),
+        (7, {"bits": 4}, "sums of 7 bitplanes have 3 bits, not 4; leave bits= out"),
         (None, {"bits": 4}, None),  # not stated: --bits says it
     ]:
         stated = {} if planes is None else {"bitplanes": planes}
@@ -142,7 +142,7 @@ def test_single_photon_challenge_cubes(tmp_path: Path):
     expected = random_planes(16, 6, 16, 3)
     np.save(tmp_path / "000.npy", np.packbits(expected, axis=2))
     np.testing.assert_array_equal(everything(tmp_path / "000.npy", layout="cube", channel=2), expected[..., 2])
-    with pytest.raises(ValueError, match="a colour cube of 3 channels; choose one with --channel 0"):
+    with pytest.raises(ValueError, match="a colour cube of 3 channels; choose one with channel=0"):
         importing.read(tmp_path / "000.npy", Hints("cube"))
 
 

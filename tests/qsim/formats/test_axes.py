@@ -48,7 +48,7 @@ def test_channels_and_slices_of_a_tiff_are_no_frames(tmp_path: Path, axes: str, 
     stored = random_frames(axes)
     tifffile.imwrite(path, stored, photometric="minisblack", metadata={"axes": axes}, **{kind: True})
     with pytest.raises(
-        ValueError, match=f"frames have one axis beside rows and columns; .*--{'channel' if 'C' in axes else 'slice'} 0"
+        ValueError, match=f"frames have one axis beside rows and columns; .*{'channel' if 'C' in axes else 'slice'}=0"
     ):
         importing.read(path, Hints(transfer="linear"))
     picks = {"channel": 3 if "C" in axes else None, "slice": 1 if "Z" in axes and "T" in axes else None}
@@ -76,11 +76,11 @@ def test_axes_without_names_are_named_by_the_user(tmp_path: Path):
 def test_axes_that_do_not_fit_are_refused(tmp_path: Path):
     np.save(tmp_path / "a.npy", np.zeros((2, 3, 4, 5), np.float32))
     for hints, message in (
-        (Hints(), r"found an array of shape \[2, 3, 4, 5\]; name its axes, as in --axes TCYX"),
+        (Hints(), r"found an array of shape \[2, 3, 4, 5\]; name its axes, as in axes=TCYX"),
         (Hints(axes="TYX"), r"names 3 axes, and the array has \[2, 3, 4, 5\]"),
         (Hints(axes="TTYX"), "a different letter for each axis"),
         (Hints(axes="TCZX"), "axes TCZX lack Y"),
-        (Hints(axes="TCYX"), "choose with --channel 0"),
+        (Hints(axes="TCYX"), "choose with channel=0"),
         (Hints(axes="TCYX", channel=3), "axis C has 3, from 0"),
         (Hints(axes="TAYX"), "frames have one axis beside rows and columns"),
         (Hints(axes="TSYX"), None),
@@ -91,7 +91,7 @@ def test_axes_that_do_not_fit_are_refused(tmp_path: Path):
         with pytest.raises(ValueError, match=message):
             importing.read(tmp_path / "a.npy", hints)
     np.save(tmp_path / "b.npy", np.zeros((2, 3, 4), np.float32))
-    with pytest.raises(ValueError, match="--channel changes nothing"):
+    with pytest.raises(ValueError, match="channel= changes nothing"):
         importing.read(tmp_path / "b.npy", Hints(channel=0))
 
 
@@ -111,7 +111,7 @@ def test_hdf5_reads_only_what_lies_in_the_file(tmp_path: Path):
         file.create_virtual_dataset("virtual", layout)
     np.testing.assert_array_equal(everything(path, dataset="/run/two", bits=12), frames)
     for name, message in (
-        (None, r"holds dark \[5, 6\], run/one \[3, 5, 6\].*choose with --dataset, as in --dataset run/one"),
+        (None, r"holds dark \[5, 6\], run/one \[3, 5, 6\].*choose with dataset=, as in dataset=run/one"),
         ("run", "run is a group; it holds one"),
         ("run/three", "has no dataset run/three; it holds"),
         ("outside", "outside is a link"),
@@ -121,7 +121,7 @@ def test_hdf5_reads_only_what_lies_in_the_file(tmp_path: Path):
     ):
         with pytest.raises(ValueError, match=message):
             importing.read(path, Hints(dataset=name, bits=12))
-    with pytest.raises(ValueError, match=r"uint16 \[3, 5, 6\]; add --bits for codes, or --transfer linear"):
+    with pytest.raises(ValueError, match=r"uint16 \[3, 5, 6\]; add bits= for codes, or transfer=linear"):
         importing.read(path, Hints(dataset="run/one"))
     path.write_bytes(path.read_bytes()[:900])
     with pytest.raises(ValueError, match="not readable as HDF5"):

@@ -25,7 +25,7 @@ def test_three_raw_layouts_of_one_size_are_not_guessed(tmp_path: Path):
     path = tmp_path / "capture.bin"
     path.write_bytes(raw_planes.spad512s(waves))
     assert path.stat().st_size == 8_388_608
-    with pytest.raises(ValueError, match=r"8388608 bytes fit .*; choose one with --layout") as caught:
+    with pytest.raises(ValueError, match=r"8388608 bytes fit .*; choose one with layout=") as caught:
         importing.read(path)
     evidence = dict(re.findall(r"([\w-]+) \(roughness ([\d.]+)\)", str(caught.value)))
     assert sorted(evidence) == ["spad512s", "swissspad2-full", "swissspad2-half"]
@@ -41,7 +41,7 @@ def test_counts_that_look_like_a_cube_are_asked_about(tmp_path: Path, top: int):
     array = np.zeros((3, 5, 7), np.uint8)
     array[1, 2, 3] = top
     np.save(tmp_path / "a.npy", array)
-    with pytest.raises(ValueError, match=rf"uint8 up to {top}: codes of .* choose with --layout codes"):
+    with pytest.raises(ValueError, match=rf"uint8 up to {top}: codes of .* choose with layout=codes"):
         importing.read(tmp_path / "a.npy")
 
 
@@ -57,7 +57,7 @@ def test_given_hints_decide_what_an_array_holds(tmp_path: Path):
     np.save(tmp_path / "b.npy", array.astype(np.uint16) * 100)
     np.testing.assert_array_equal(everything(tmp_path / "b.npy", bits=10), array.astype(np.uint16) * 100)
     np.save(tmp_path / "planes.npy", np.random.default_rng(1).integers(0, 256, (3, 5, 7)).astype(np.uint8))
-    with pytest.raises(ValueError, match="--bits changes nothing for photon cube"):
+    with pytest.raises(ValueError, match="bits= changes nothing for photon cube"):
         everything(tmp_path / "planes.npy", bits=1)
 
 
@@ -95,7 +95,7 @@ def test_detection_by_name_signature_and_type(tmp_path: Path):
     kinds = {"cube": "cube", "light": "light", "counts": "light", "planes": "codes"}
     assert {name: detection.detect(tmp_path / f"{name}.npy") for name in kinds} == kinds
     (tmp_path / "x.xyz").touch()
-    with pytest.raises(ValueError, match="unknown kind of file; name it with `qsim convert --layout`: cube, "):
+    with pytest.raises(ValueError, match="unknown kind of file; name its layout=: cube, "):
         importing.read(tmp_path / "x.xyz")
     with pytest.raises(FileNotFoundError, match="no such file"):
         importing.read(tmp_path / "none.npy")
@@ -172,7 +172,7 @@ def test_a_gzipped_array_is_asked_about_like_another(tmp_path: Path):
         if array.dtype == bool:
             np.testing.assert_array_equal(everything(packed), array)
             continue
-        with pytest.raises(ValueError, match=r"a\.npy\.gz: uint8 up to 7: codes of 3 bits.* --layout codes"):
+        with pytest.raises(ValueError, match=r"a\.npy\.gz: uint8 up to 7: codes of 3 bits.* layout=codes"):
             importing.read(packed)
         np.testing.assert_array_equal(everything(packed, bits=3), codes)
 
@@ -184,7 +184,7 @@ def test_a_preview_beside_a_recording_is_not_taken_for_it(tmp_path: Path, other)
     folder.mkdir()
     images.write_png(folder, iter(np.zeros((1, 8, 10), np.uint8)))
     (folder / other).write_bytes(b"II*\0")
-    with pytest.raises(ValueError, match=r"holds recordings of two kinds \(.*; choose with --layout$"):
+    with pytest.raises(ValueError, match=r"holds recordings of two kinds \(.*; choose with layout=$"):
         detection.detect(folder)
 
 
@@ -214,7 +214,7 @@ def test_an_array_beside_a_picture_is_not_dropped(tmp_path: Path):
 
 
 def test_signed_codes_are_codes(tmp_path: Path):
-    """NumPy's default integers were taken for a picture, whose --transfer then refused --bits."""
+    """NumPy's default integers were taken for a picture, whose transfer curve then refused bits."""
     codes = np.random.default_rng(0).integers(0, 8, (4, 8, 8))
     np.save(tmp_path / "x.npy", codes)
     np.testing.assert_array_equal(everything(tmp_path / "x.npy", bits=3), codes)
@@ -231,7 +231,7 @@ def test_missing_shards_and_parts_are_told(tmp_path: Path):
     description = {"w": 16, "h": 5, "frames": [{"file_path": str(i)} for i in range(8)]}
     (scene / "transforms.json").write_text(json.dumps(description))
     np.save(scene / "0000.npy", planes)
-    with pytest.raises(ValueError, match=r"3 colour planes; choose one with --channel 0"):
+    with pytest.raises(ValueError, match=r"3 colour planes; choose one with channel=0"):
         importing.read(scene)  # the file states no number of channels
     with pytest.raises(ValueError, match=r"4 frames, and transforms\.json states 8; add the shards that are missing"):
         importing.read(scene, Hints(channel=1))
@@ -273,7 +273,7 @@ def test_the_smoothest_layout_is_the_true_one(tmp_path, bits, layout):
     planes = (rng.random((32, 512, 512)) < scene).astype(np.uint8)
     path = tmp_path / "texture.bin"
     path.write_bytes(np.packbits(planes, axis=2, bitorder=bits).tobytes())
-    with pytest.raises(ValueError, match="choose one with --layout") as refused:
+    with pytest.raises(ValueError, match="choose one with layout=") as refused:
         detection.detect(path)
     found = dict(re.findall(r"(\S+) \(roughness ([0-9.]+)\)", str(refused.value)))
     least = min(found, key=lambda name: float(found[name]))
@@ -288,7 +288,7 @@ def test_a_full_plane_read_as_two_halves_is_no_smoother(tmp_path):
     planes = (np.random.default_rng(0).random((12, 512, 512), np.float32) < scene).astype(np.uint8)
     path = tmp_path / "shape.bin"
     path.write_bytes(raw_planes.spad512s(planes))
-    with pytest.raises(ValueError, match="choose one with --layout") as refused:
+    with pytest.raises(ValueError, match="choose one with layout=") as refused:
         detection.detect(path)
     found = dict(re.findall(r"(\S+) \(roughness ([0-9.]+)\)", str(refused.value)))
     assert min(found, key=lambda name: float(found[name])) == "spad512s"

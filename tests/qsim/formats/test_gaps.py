@@ -76,7 +76,7 @@ def test_lost_pictures_are_told_and_kept_as_missing(tmp_path: Path):
         warnings.simplefilter("error")
         assert importing.read(even, Hints(**hints)).shape == (4, 4, 6)
     np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), np.float32))
-    with pytest.raises(ValueError, match=r"--keep-gaps changes nothing for \.npy"):
+    with pytest.raises(ValueError, match=r"keep_gaps= changes nothing for \.npy"):
         importing.read(tmp_path / "a.npy", Hints(keep_gaps=True))
 
 

@@ -69,7 +69,7 @@ def png_16(pixels: np.ndarray, kind: int) -> bytes:
 
 
 def test_codes_in_pictures(tmp_path: Path):
-    """One-bit PNG, unstretched codes, stretched codes; stretched files need --stretched."""
+    """One-bit PNG, unstretched codes, stretched codes; stretched files need `stretched`."""
     bits1 = random_planes(2, 5, 7).astype(bool)
     codes = np.random.default_rng(1).integers(0, 8, (2, 5, 7)).astype(np.uint8)
     codes[0, 0, :2] = 0, 7
@@ -79,7 +79,7 @@ def test_codes_in_pictures(tmp_path: Path):
     np.testing.assert_array_equal(everything(tmp_path / "one"), bits1)
     np.testing.assert_array_equal(everything(tmp_path / "three", bits=3), codes)
     np.testing.assert_array_equal(everything(tmp_path / "wide", bits=3, stretched=True), codes)
-    with pytest.raises(ValueError, match=r"value \d+ at \(t, y, x\) = .* is not a 3-bit code .* --stretched"):
+    with pytest.raises(ValueError, match=r"value \d+ at \(t, y, x\) = .* is not a 3-bit code .* stretched=True"):
         everything(tmp_path / "wide", bits=3)
     lossy = code_levels(codes, 3)
     lossy[1, 2, 3] ^= 2
@@ -138,7 +138,7 @@ def test_one_bit_tiff_of_both_polarities(tmp_path: Path):
 
 
 def test_tiff_of_other_colours_is_not_read_as_grey_or_rgb(tmp_path: Path):
-    """Indices of a palette were light, cyan was red; --bits says that the indices are codes."""
+    """Indices of a palette were light, cyan was red; `bits` says that the indices are codes."""
     import tifffile
 
     path = tmp_path / "a.tif"

@@ -62,7 +62,7 @@ def test_wrong_kinds_are_refused_with_advice(tmp_path: Path):
         with pytest.raises(ValueError, match=message):
             exporting.export(source, tmp_path / "out", Export(kind))
         assert not (tmp_path / "out").exists()
-    with pytest.raises(FileExistsError, match="--force"):
+    with pytest.raises(FileExistsError, match="force=True"):
         importing.to_stream(codes, tmp_path / "s", CAPTURE)
 
 
@@ -289,5 +289,5 @@ def test_a_light_level_that_sets_no_gain_is_refused(tmp_path: Path):
     np.save(tmp_path / "codes.npy", np.random.default_rng(0).integers(0, 8, (2, 5, 6)).astype(np.uint8))
     recording = importing.read(tmp_path / "codes.npy", Hints(bits=3))
     for name in ("spad-320x240", "quiver-paper"):
-        with pytest.raises(ValueError, match=f"--ppp changes nothing for {name}, whose gain is fixed; leave it out"):
+        with pytest.raises(ValueError, match=f"ppp= changes nothing for {name}, whose gain is fixed; leave it out"):
             importing.to_stream(recording, tmp_path / "s", Import(1000.0, sensor=name, ppp=5.0))

@@ -34,7 +34,7 @@ def test_the_only_array_of_a_mat_is_taken(tmp_path, level):
 
 def test_a_name_of_an_array_is_refused_elsewhere(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), bool))
-    with pytest.raises(ValueError, match="--variable changes nothing for codes; leave it out"):
+    with pytest.raises(ValueError, match="variable= changes nothing for codes; leave it out"):
         importing.read(tmp_path / "a.npy", Hints(variable="x"))
 
 

@@ -79,13 +79,13 @@ def test_what_a_raw_file_does_not_state_must_be_given(tmp_path: Path):
     path.write_bytes(bytes(24))
     size: dict[str, Any] = {"layout": "raw", "height": 4, "width": 4}
     for hints, message in (
-        ({"layout": "raw"}, "add --height and --width and --bits"),
-        (size | {"bits": 1}, "pixels of 1 bits; add --order msb or lsb"),
-        (size | {"bits": 12}, "add --order msb or lsb if they are packed, or --endian"),
-        (size | {"bits": 16}, "add --endian little or --endian big"),
+        ({"layout": "raw"}, "add height= and width= and bits="),
+        (size | {"bits": 1}, "pixels of 1 bits; add order=msb or lsb"),
+        (size | {"bits": 12}, "add order=msb or lsb if they are packed, or endian="),
+        (size | {"bits": 16}, "add endian=little or endian=big"),
         (
             size | {"bits": 12, "order": "msb", "endian": "big"},
-            "--order states packed pixels, --endian pixels of whole bytes",
+            "order= states packed pixels, endian= pixels of whole bytes",
         ),
         (size | {"bits": 8}, "24 bytes are not a whole number of raw .4 x 4 pixels of 8 bits"),
         (size | {"bits": 8, "skip_bytes": 40}, "24 bytes, fewer than the 40 to skip"),
@@ -151,7 +151,7 @@ def test_photron_recordings(tmp_path: Path, text: str, stored: int, depth: int, 
     assert (recording.frame_rate, recording.exposure) == (20000, 2e-5)
     clip = importing.to_clip(recording, tmp_path / "clip", importing.Import(20000))
     assert clip.exposure == 2e-5
-    with pytest.raises(ValueError, match=r"--frame-rate 1000: Photron \.mraw state 20000; leave it out"):
+    with pytest.raises(ValueError, match=r"frame_rate=1000: Photron \.mraw state 20000; leave it out"):
         importing.to_clip(recording, tmp_path / "other", importing.Import(1000))
     np.testing.assert_array_equal(everything(beside), frames)
     beside.write_text(text.format(**facts | {"frames": 4}))

@@ -226,7 +226,7 @@ def test_every_reader_says_bit_order_and_orientation(tmp_path: Path, layout: str
 def test_a_disputed_side_stays_disputed_and_a_flip_is_remembered(tmp_path: Path):
     (tmp_path / "a.bin").write_bytes(bytes(32768))
     disputed = "as stored, left and right are disputed"
-    for flip, said in [("none", disputed), ("lr", f"{disputed}; then --flip lr")]:
+    for flip, said in [("none", disputed), ("lr", f"{disputed}; then flip=lr")]:
         stream = importing.to_stream(
             importing.read(tmp_path / "a.bin", Hints("spad512s", flip=flip)), tmp_path / flip, CAPTURE
         )
@@ -235,9 +235,9 @@ def test_a_disputed_side_stays_disputed_and_a_flip_is_remembered(tmp_path: Path)
         assert json.loads(cube.with_name(cube.name + ".json").read_text())["orientation"] == said
     np.save(tmp_path / "light.npy", np.ones((2, 3, 4), np.float32))
     clip = importing.to_clip(importing.read(tmp_path / "light.npy", Hints(flip="ud")), tmp_path / "clip", CAPTURE)
-    assert clip.info.source.orientation == "upright; then --flip ud"
+    assert clip.info.source.orientation == "upright; then flip=ud"
     sensed, _ = sense(clip, Sensing("quiver-physical", ppp=3.25))
-    assert sensed.info.orientation == "upright; then --flip ud"
+    assert sensed.info.orientation == "upright; then flip=ud"
 
 
 def test_a_recording_of_unknown_orientation_is_not_called_upright(tmp_path: Path):

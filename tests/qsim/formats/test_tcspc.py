@@ -18,7 +18,7 @@ def test_ptu_images(tmp_path: Path):
     path = tmp_path / "a.ptu"
     ptufile.imwrite(path, FRAMES, 1e-7, 1e-8, pixel_time=1e-5)
     counts = FRAMES.sum(axis=-1)
-    with pytest.raises(ValueError, match="choose with --channel 0"):
+    with pytest.raises(ValueError, match="choose with channel=0"):
         importing.read(path)
     for channel in (0, 1):
         np.testing.assert_array_equal(everything(path, channel=channel), counts[..., channel])
@@ -42,7 +42,7 @@ def test_sdt_images(tmp_path: Path):
     np.testing.assert_array_equal(everything(path, channel=2), counts[2:])
     np.testing.assert_array_equal(everything(path, axes="TYX"), counts)
     with pytest.raises(
-        ValueError, match=r"axes C=3, Y=5, X=6: .*choose with --channel 0 \(to 2\), or name the axis of the frames T"
+        ValueError, match=r"axes C=3, Y=5, X=6: .*choose with channel=0 \(to 2\), or name the axis of the frames T"
     ):
         importing.read(path)
     path.write_bytes(path.read_bytes()[:60])

@@ -41,7 +41,7 @@ def test_odd_sizes_of_video(tmp_path: Path):
     np.testing.assert_array_equal(
         np.rint(everything(path, transfer="linear") * 255), from_linear(frames, "gamma 2.2", 255)
     )
-    with pytest.raises(ValueError, match=r"lossy H\.264 needs even sizes, .*; leave --lossy out$"):
+    with pytest.raises(ValueError, match=r"lossy H\.264 needs even sizes, .*; leave lossy=True out$"):
         exporting.export(clip, tmp_path / "l.mp4", Export("mp4", lossless=False))
     assert not (tmp_path / "l.mp4").exists()
 

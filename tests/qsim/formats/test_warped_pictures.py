@@ -10,7 +10,7 @@ from PIL import Image
 from scipy import ndimage
 
 from qsim import files
-from qsim.formats import warped_pictures
+from qsim.cli import warped_pictures
 from qsim.formats.warped_pictures import Layer, Path2D, frame, layers
 from qsim.streams.clip import Clip
 from quiver.data.clips import open_clips
@@ -128,7 +128,7 @@ def test_a_second_licence_leaves_the_first_one(pictures, tmp_path):
     ("words", "named"),
     [
         (["--height", 200], "half of which is less than 200 px"),
-        (["--motion", -1], "expected 0 to 100 px/frame"),
+        (["--motion", -1], "expected a number from 0 to 100"),
         (["--clips", 0], "expected a whole number"),
         (["--licence", "none.txt"], "none.txt: no such file; name the file that states the licence"),
     ],

@@ -82,7 +82,7 @@ def test_what_mitsuba_rejects_while_it_renders_is_one_sentence(tmp_path):
 
 def test_a_light_that_needs_colour_is_read_in_colour(tmp_path):
     path = write(tmp_path, light='<emitter type="sunsky"/>')
-    with pytest.raises(ValueError, match="render with --bands rgb"):
+    with pytest.raises(ValueError, match="render with bands='rgb'"):
         load_scene(str(path), None, None, 0, None)
     scene, _ = load_scene(str(path), None, None, 0, None, "rgb")
     assert scene.bands is not None

@@ -203,7 +203,7 @@ def test_neither_the_picture_nor_its_json_is_replaced_without_force(clip, tmp_pa
     beside = tmp_path / "a.png.json"
     beside.write_text("mine")
     assert main(["preview", str(clip.path), "-o", str(target), "--what", "sharp"]) == 2
-    assert "a.png.json: exists; name another with -o, or use --force" in capsys.readouterr().err
+    assert "a.png.json: exists; name another, or replace it with --force" in capsys.readouterr().err
     assert (beside.read_text(), target.exists()) == ("mine", False)
     assert main(["preview", str(clip.path), "-o", str(target), "--what", "sharp", "--force"]) == 0
     assert json.loads(beside.read_text())["frames"] == [2, 3]

@@ -49,7 +49,7 @@ def test_light_beyond_the_sensor_models_is_refused(tmp_path: Path):
 
 def test_relative_radiance_needs_a_target(tmp_path: Path):
     clip = write(tmp_path / "r", radiance_unit=RELATIVE, camera=None)
-    with pytest.raises(ValueError, match=r"r: its radiance is relative .* --ppp 3.25"):
+    with pytest.raises(ValueError, match=r"r: its radiance is relative .* ppp=3.25"):
         light_level(clip)
     level = light_level(clip, ppp=3.25)
     mean = np.mean([clip_photons(clip, t, level.factor).mean() for t in range(FRAMES)])
@@ -59,9 +59,7 @@ def test_relative_radiance_needs_a_target(tmp_path: Path):
 def test_lux_of_a_clip_without_a_camera_need_a_pixel_pitch(tmp_path: Path):
     """1 lx at 555 nm on 1.1 um for 4.167 ms: (1/683) W/m2 * 1.21e-12 m2 * 4.167e-3 s / 3.5792e-19 J = 20.6 photons."""
     clip = write(tmp_path / "r", radiance_unit=RELATIVE, camera=None, exposure=1 / 240, frame_rate=240.0)
-    with pytest.raises(
-        ValueError, match=r"as in --pixel-pitch 1.1e-06, where 1 lx at 555 nm is 20\.6 PPP in 4\.167 ms"
-    ):
+    with pytest.raises(ValueError, match=r"as in pixel_pitch=1.1e-06, where 1 lx at 555 nm is 20\.6 PPP in 4\.167 ms"):
         light_level(clip, lux=3.0)
     level = light_level(clip, lux=3.0, pixel_pitch=1.1e-6)
     assert level.ppp == pytest.approx(3 * 20.62, rel=1e-3)

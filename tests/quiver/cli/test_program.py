@@ -225,13 +225,13 @@ def test_nothing_is_overwritten_without_force(capsys, tmp_path, tiny_dataset, cl
     video = tmp_path / "v.npy"
     video.write_text("mine")
     words = ["restore", clip, "-o", video, "--method", "moment", "--ppp", 3.25]
-    assert "exists; name another with -o, or use --force" in mistake(capsys, *words)
+    assert "exists; name another, or replace it with --force" in mistake(capsys, *words)
     assert video.read_text() == "mine"
     assert "has no .json that describes restored video" in mistake(capsys, *words, "--force")
     assert video.read_text() == "mine"
     video.unlink()
     assert run(capsys, *words)[0] == 0
-    assert "exists; name another with -o, or use --force" in mistake(capsys, *words)
+    assert "exists; name another, or replace it with --force" in mistake(capsys, *words)
     assert run(capsys, *words, "--force")[0] == 0
     assert np.load(video).shape == (14, 36, 44)
     for name in ("v", "v.mp4"):
@@ -242,11 +242,11 @@ def test_nothing_is_overwritten_without_force(capsys, tmp_path, tiny_dataset, cl
     folder.mkdir()
     (folder / "thesis.txt").write_text("mine")
     assert "is not a training run" in mistake(capsys, *train_words(tiny_dataset, folder))
-    assert "--force removes only what this command made" in mistake(
-        capsys, *train_words(tiny_dataset, folder), "--force"
-    )
+    assert "only what this program made is removed" in mistake(capsys, *train_words(tiny_dataset, folder), "--force")
     assert "is not an evaluation" in mistake(capsys, "evaluate", tiny_dataset, "-o", folder)
-    assert "--force removes only" in mistake(capsys, "evaluate", tiny_dataset, "-o", folder, "--force")
+    assert "only what this program made is removed" in mistake(
+        capsys, "evaluate", tiny_dataset, "-o", folder, "--force"
+    )
     assert (folder / "thesis.txt").read_text() == "mine"
 
 

@@ -15,7 +15,7 @@ from domains import weights
 from safetensors.torch import load_file
 from sensor_files import FILES, sensor_file
 
-from qsim.files import sha256
+from qsim.files import Blocked, Damaged, sha256
 from quiver import threads
 from quiver.cli import train
 from quiver.cli.program import main
@@ -170,15 +170,15 @@ def test_an_ablation_has_clips_to_score_before_it_trains(capsys, make_clip: Clip
     ("error", "message"),
     [
         (
-            FileExistsError("x holds another evaluation; choose another -o, or start again with --force"),
+            Blocked("x holds another evaluation", "choose another folder, or start again with force=True"),
             "x holds another evaluation; choose another -o",
         ),
         (
-            ValueError("x: not a state of this run (y); start again with --force"),
+            Damaged("x: not a state of this run (y)", "start again with force=True"),
             "x: not a state of this run (y); choose another -o",
         ),
         (
-            loop.Diverged("loss nan; lower the learning rate and start again with --force"),
+            loop.Diverged("loss nan"),
             "loss nan; choose another --protocol or --seed, and another -o",
         ),
     ],
@@ -196,7 +196,7 @@ def test_a_damaged_ablation_is_refused_without_force(capsys, tiny_dataset, tmp_p
     (tmp_path / "x/none").mkdir(parents=True)
     (tmp_path / "x/none/settings.json").write_text(json.dumps({"noise": []}))
     said = told(capsys, "ablate", tiny_dataset, "-o", tmp_path / "x", "--steps", 1, "-q")
-    assert said.endswith("settings.json: noise is []; choose another -o\n")
+    assert said.endswith("settings.json: noise is []; the file is damaged; choose another -o\n")
 
 
 def test_force_keeps_a_run_where_the_sensor_tells_nothing(capsys, tiny_dataset, tmp_path):
@@ -245,23 +245,24 @@ def test_interrupted_measurements_state_what_continues(capsys, tiny_dataset, tmp
 
 
 STOPS = {
-    3: "quiver: step 2: loss nan; lower the learning rate",
-    130: "quiver: interrupted; the same command resumes where it stopped",
+    ("train", 3): "quiver: step 2: loss nan; lower the learning rate and start again with --force",
+    ("ablate", 3): "quiver: step 2: loss nan; choose another --protocol or --seed, and another -o",
+    ("ablate", 130): "quiver: interrupted; the same command resumes where it stopped",
 }
 
 
-@pytest.mark.parametrize(("command", "code"), [("train", 3), ("ablate", 3), ("ablate", 130)])
+@pytest.mark.parametrize(("command", "code"), list(STOPS))
 def test_a_run_that_fails_is_told_in_json(capsys, tiny_dataset, tmp_path, monkeypatch, command, code):
     def ends(*_: object, **__: object) -> None:
         if code == 3:
-            raise loop.Diverged(STOPS[3].removeprefix("quiver: "))
+            raise loop.Diverged("step 2: loss nan")
 
     monkeypatch.setattr(loop, "train", ends)
     monkeypatch.setattr(ablation, "run_ablation", ends)
     assert main([command, str(tiny_dataset), "-o", str(tmp_path / "r"), "--steps", "1", "--json", "-q"]) == code
     out, err = capsys.readouterr()
-    assert json.loads(out) == {"error": STOPS[code], "exit_code": code}
-    assert err == f"{STOPS[code]}\n"
+    assert json.loads(out) == {"error": STOPS[command, code], "exit_code": code}
+    assert err == f"{STOPS[command, code]}\n"
 
 
 @pytest.mark.parametrize("command", ["train", "ablate"])
@@ -311,12 +312,12 @@ def test_a_curve_that_falls_is_told(capsys, tiny_dataset, tmp_path, monkeypatch,
 @pytest.mark.parametrize(
     ("methods", "more", "message"),
     [
-        (("moment",), {"modes": ("exact",)}, "--modes: acts on networks, and moment is classical"),
-        (("moment", "naive"), {"precisions": ("float32",)}, "--precisions: acts on networks, and moment, naive"),
-        (("moment",), {"device": "cpu"}, "--device: acts on networks"),
-        (("unet",), {"modes": ("exact",)}, "--modes: acts on QUIVER, unet has one mode"),
-        (("quiver-s",), {"modes": ("exat",)}, "--modes: no 'exat' (did you mean 'exact'?)"),
-        (("quiver-s",), {"precisions": ("float16",)}, "--precisions: no 'float16' (did you mean 'bfloat16'?)"),
+        (("moment",), {"modes": ("exact",)}, "modes=: acts on networks, and moment is classical"),
+        (("moment", "naive"), {"precisions": ("float32",)}, "precisions=: acts on networks, and moment, naive"),
+        (("moment",), {"device": "cpu"}, "device=: acts on networks"),
+        (("unet",), {"modes": ("exact",)}, "modes=: acts on QUIVER, unet has one mode"),
+        (("quiver-s",), {"modes": ("exat",)}, "modes=: no 'exat' (did you mean 'exact'?)"),
+        (("quiver-s",), {"precisions": ("float16",)}, "precisions=: no 'float16' (did you mean 'bfloat16'?)"),
         (("momnt",), {}, "no method 'momnt'"),
         (("moment:x",), {}, "the window after the colon is a number of frames"),
         (("none.safetensors",), {}, "none.safetensors: no such weights file"),
@@ -334,7 +335,7 @@ def test_bench_replaces_only_with_a_folder(capsys, tmp_path):
     (tmp_path / "b").mkdir()
     (tmp_path / "b/bench.json").write_text(json.dumps({}))
     said = told(capsys, "bench", "--methods", "naive", "-o", tmp_path / "b")
-    assert "exists; name another with -o, or use --force" in said
+    assert "exists; name another, or replace it with --force" in said
 
 
 def test_one_ablation_and_one_measurement_at_a_time(capsys, tiny_dataset, tmp_path):

@@ -104,7 +104,7 @@ def test_what_windows_cannot_have_is_refused(make_clip: ClipMaker, tmp_path):
         Windows([make_clip()], WindowSettings(crop=16, lights=(Illumination.of(counter, 3.0, 3),)))
     sums = make_clip("sums")
     sense(sums, Sensing("spad-320x240", bits=2, ppp=3.0, group=True))
-    with pytest.raises(ValueError, match=r"one full exposure .* this has codes of 3 clip frames; give --sensor"):
+    with pytest.raises(ValueError, match=r"one full exposure .* this has codes of 3 clip frames; give sensor="):
         choose([sums])
     assert choose([sums], ["spad-320x240"], [1.0], [2]).lines[0].startswith("noise: spad-320x240, 2 bits, 1 PPP")
     own = sensor_file(tmp_path, QIS, 4)

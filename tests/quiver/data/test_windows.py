@@ -221,10 +221,10 @@ def test_of_more_clips_than_windows_each_gives_one_at_most(make_clip: ClipMaker)
 
 
 def test_clips_that_hold_no_window_are_named(make_clip: ClipMaker):
-    needs = "clip short is 5 x 36 x 44; a window needs 11 frames of 16 x 16 px; choose fewer --frames, or other clips"
+    needs = "clip short is 5 x 36 x 44; a window needs 11 frames of 16 x 16 px; choose fewer frames=, or other clips"
     with pytest.raises(ValueError, match=needs):
         Windows([make_clip("short", frames=5)], WindowSettings(crop=16))
-    with pytest.raises(ValueError, match="choose a smaller --crop, or other clips"):
+    with pytest.raises(ValueError, match="choose a smaller crop=, or other clips"):
         Windows([make_clip("small", frames=11)], WindowSettings(crop=40))
     with pytest.raises(ValueError, match="no complete clip"):
         Windows([], WindowSettings())
@@ -318,7 +318,7 @@ def test_a_scene_at_rest_has_no_motion_blur(make_clip: ClipMaker, reverse):
         assert np.abs(found / target - 1).max() < 6 / np.sqrt(11 * 0.5 * target.min())  # the exposed frame: 0.1
 
 
-@pytest.mark.parametrize(("least", "advice"), [(11, "give clips of 11 frames or more"), (1, "choose fewer --frames")])
+@pytest.mark.parametrize(("least", "advice"), [(11, "give clips of 11 frames or more"), (1, "choose fewer frames=")])
 def test_the_advice_for_short_clips_can_be_followed(make_clip: ClipMaker, least, advice):
     with pytest.raises(ValueError, match=f"a window needs 11 frames .*; {advice}"):
         Windows([make_clip(frames=8)], WindowSettings(crop=16, least=least))

@@ -327,7 +327,7 @@ def test_published_protocol_forces_every_window(tiny_dataset):
     assert len(levels) == 2 * 4
     assert max(levels) - min(levels) < 0.1
     assert rows[0].score.scale_spread > 0
-    with pytest.raises(ValueError, match="give --ppp"):
+    with pytest.raises(ValueError, match="give ppp="):
         evaluate(
             Comparison(str(tiny_dataset), lights=(Illumination.of("quiver-paper", None),), published=True),
             [method("x", look)],

@@ -70,7 +70,7 @@ def test_weights_of_a_folder_have_the_modes_of_their_network(tmp_path):
     assert [(case.method, case.mode) for case in cases] == [
         *((unet, "exact"), (quiver, "exact"), (quiver, "streaming"), ("moment", "exact"))
     ]
-    with pytest.raises(ValueError, match=r"--modes: acts on QUIVER, .*/u has one mode; leave it out"):
+    with pytest.raises(ValueError, match=r"modes=: acts on QUIVER, .*/u has one mode; leave it out"):
         checked_cases((unet,), ("streaming",), None, "cpu")
 
 

@@ -81,7 +81,7 @@ def test_a_damaged_domain_is_one_line(tmp_path):
     assert refused > 200
     path = weights(tmp_path)
     annotate(path, {domain.KEY: "{}"})
-    with pytest.raises(ValueError, match=r"small\.safetensors: its domain is damaged .*`quiver domain --force`"):
+    with pytest.raises(ValueError, match=r"small\.safetensors: its domain is damaged .*measure it again"):
         network_restorer(path, RestoreOptions(device="cpu"))
 
 

@@ -141,7 +141,7 @@ def test_cuda_is_asked_for_by_name(tmp_path: Path):
         pytest.skip("this machine has CUDA")
     network = UNet(UNetConfig(2))
     save(network, network.config, tmp_path / "w.safetensors")
-    with pytest.raises(ValueError, match="--device cuda: torch finds no CUDA"):
+    with pytest.raises(ValueError, match="device=cuda: torch finds no CUDA"):
         restorer(str(tmp_path / "w.safetensors"), RestoreOptions(device="cuda"))
 
 

@@ -53,7 +53,7 @@ def quiet(method: Restorer, codes: Codes) -> Array:
 def test_tiles_that_rvrt_would_fill_are_refused():
     """It computes 64 px as 132 px: a bound of 200 MB took 367 MB."""
     network = build("rvrt")
-    with pytest.raises(ValueError, match=r"a tile needs at least 132 x 132; raise --memory$"):
+    with pytest.raises(ValueError, match=r"a tile needs at least 132 x 132; raise memory=$"):
         cut_pieces(network, 64, 64, 200_000_000)
     assert cut_pieces(network, 64, 64, bytes_needed(network, 132, 132)).exact
     rng = np.random.default_rng(3)

@@ -148,7 +148,7 @@ def test_a_restoration_of_something_else_starts_again(tmp_path, make_clip, block
             why = "settings"
         case "tiles":
             old = replace(old, cut=lambda height, width: "10 tiles")
-            why = "but the tiles of a frame, by --memory and the device, were 10 tiles and are none now"
+            why = "but the tiles of a frame, by memory= and the device, were 10 tiles and are none now"
         case "sensor":
             after = array_codes(after.read(0, 10), replace(SENSOR, gain=1.0), EXPOSURE)
             why = "the sensor"
@@ -262,7 +262,7 @@ def test_a_writer_killed_between_the_two_renames_is_finished_by_the_same_command
         assert main(again) == code
         assert sorted(os.listdir(tmp_path)) == ["codes.npy", "r.json", "r.npy"]
         assert (tmp_path / "r.json").read_bytes() == held
-    assert "r.npy: exists; name another with -o, or use --force" in capsys.readouterr().err
+    assert "r.npy: exists; name another, or replace it with --force" in capsys.readouterr().err
 
 
 # One writer

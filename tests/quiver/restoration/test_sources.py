@@ -192,6 +192,6 @@ def test_defects_that_are_not_inverted_are_told(make_clip, tmp_path):
     for codes in (stream_codes(stream), now, repaired(bare, read_sensor(path)[1])):
         assert ", crosstalk and afterpulse not inverted (restored light is too bright)," in assumed(codes, naive)
     assert "inverted" not in assumed(bare, naive)
-    assert restore_to_file(now, naive, tmp_path / "r.npy")["not_inverted"] == "crosstalk and afterpulse"
+    assert restore_to_file(now, naive, tmp_path / "r.npy").not_inverted == "crosstalk and afterpulse"
     with pytest.warns(UserWarning, match="crosstalk and afterpulse not inverted, restored light is too bright"):
         quiver.restore(stream, "naive")

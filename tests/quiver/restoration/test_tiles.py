@@ -51,7 +51,7 @@ def test_the_cut_with_the_smallest_area_is_taken():
 
 
 def test_a_bound_below_one_tile_is_refused():
-    with pytest.raises(ValueError, match=r"tile needs at least 80 x 80; raise --memory"):
+    with pytest.raises(ValueError, match=r"tile needs at least 80 x 80; raise memory="):
         cut_tiles(200, 200, 1000, 32, 16)
 
 

@@ -261,7 +261,7 @@ def test_a_time_limit_ends_the_run(tiny_dataset, tmp_path, monkeypatch):
 
 
 def test_a_crop_must_fit_the_network(tiny_dataset, tmp_path):
-    with pytest.raises(ValueError, match="--crop 18: this network needs a multiple of 4"):
+    with pytest.raises(ValueError, match="crop=18: this network needs a multiple of 4"):
         train(small_network(), settings(tiny_dataset, tmp_path / "r", crop=18), progress=False)
     assert not (tmp_path / "r").exists()
 

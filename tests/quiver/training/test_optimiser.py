@@ -33,7 +33,7 @@ def steps(unet: UNet, kind: str) -> dict[str, torch.Tensor]:
 
 def test_a_torch_without_muon_is_told(monkeypatch):
     monkeypatch.delattr(torch.optim, "Muon")
-    with pytest.raises(ValueError, match=r"Muon needs torch 2\.9 or newer, this is .*; choose --optimiser adam"):
+    with pytest.raises(ValueError, match=r"Muon needs torch 2\.9 or newer, this is .*; choose optimiser=adam"):
         Optimiser(network(), "muon", RATE, (0.9, 0.99))
     Optimiser(network(), "adam", RATE, (0.9, 0.99))
 

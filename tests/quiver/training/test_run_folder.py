@@ -52,7 +52,7 @@ def test_other_settings_are_refused(tiny_dataset, tmp_path):
     (tmp_path / "other").mkdir()
     (tmp_path / "other/file").write_text("mine")
     for force in (False, True):
-        with pytest.raises(FileExistsError, match=r"is not a training run|removes only what this command made"):
+        with pytest.raises(FileExistsError, match=r"is not a training run|only what this program made"):
             opened(settings(tiny_dataset, tmp_path / "other"), force=force)
     assert (tmp_path / "other/file").read_text() == "mine"
 
@@ -78,7 +78,7 @@ def test_other_conditions_are_refused(tmp_path, name, began, now, says):
 
     again(began)
     again(began)
-    with pytest.raises(FileExistsError, match=f"{says}.*; resume it as it began, choose another -o, or start again"):
+    with pytest.raises(FileExistsError, match=f"{says}.*; resume it as it began, choose another folder"):
         again(now)
     again(now, force=True)
     again(now)
@@ -230,7 +230,7 @@ def test_any_value_at_any_place_of_a_checkpoint(tmp_path, cases):
         try:
             resumed(run)
         except Exception as error:
-            one_line(error, run.checkpoint, "start again with --force")
+            one_line(error, run.checkpoint, "start again with force=True")
             refusals += 1
         assert time.process_time() - started < patience()
         assert peak_memory() - before < MEMORY

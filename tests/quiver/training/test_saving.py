@@ -2,15 +2,14 @@
 
 from pathlib import Path
 
-from quiver.cli.program import parser
+from quiver.cli.program import PROGRAM
 from quiver.training.saving import CHECKPOINT_SECONDS, WHEN, first_line
 
 ROOT = Path(__file__).parents[3]
 
 
 def test_help_and_page_state_the_interval():
-    help_text = " ".join(parser()._subparsers._group_actions[0].choices["train"].format_help().split())
-    assert WHEN in help_text
+    assert WHEN in " ".join(PROGRAM.help("train").split())
     page = " ".join((ROOT / "docs" / "training.md").read_text(encoding="utf-8").split())
     assert f"at the first validation, then every {CHECKPOINT_SECONDS:g} s, at the end, and on Ctrl-C" in page
 

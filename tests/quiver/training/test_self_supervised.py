@@ -147,7 +147,7 @@ def test_windows_are_parts_of_the_stream(stream):
         seen.add((start, y, x))
     assert len(seen) > 4
     for size in ({"frames": 17}, {"crop": 25}):
-        with pytest.raises(ValueError, match="choose a smaller --crop or fewer --frames"):
+        with pytest.raises(ValueError, match="choose a smaller crop= or fewer frames="):
             StreamWindows(codes, replace(plain, **size))
 
 

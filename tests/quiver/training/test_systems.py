@@ -344,23 +344,23 @@ def test_every_preset_has_a_system_and_a_quick_protocol():
         assert set(protocol(system, "quick")) <= known
         assert (system is OURS) == (name in ("quiver-s-1m", *QUIVERS))
     assert set(KINDS) >= set(SYSTEMS)
-    with pytest.raises(ValueError, match="--protocol paper: emvd has quick and published"):
+    with pytest.raises(ValueError, match="protocol=paper: emvd has quick and published"):
         protocol(system_named("emvd"), "paper")
 
 
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
-        ("unet", {"frames": 10}, "--frames must be at least 11, the window of unet, got 10"),
-        ("rvrt", {"frames": 11}, "--frames must be at least 12, the window of rvrt, got 11"),
+        ("unet", {"frames": 10}, "frames= must be at least 11, the window of unet, got 10"),
+        ("rvrt", {"frames": 11}, "frames= must be at least 12, the window of rvrt, got 11"),
         ("spk2imgnet", {"frames": 9}, "at least 10"),
-        ("emvd", {"crop": 36}, "--crop 36: this network needs a multiple of 8"),
+        ("emvd", {"crop": 36}, "crop=36: this network needs a multiple of 8"),
         ("memdeblur", {"crop": 24}, "multiple of 16"),
-        ("rvrt", {"loss": "l1"}, "--loss l1: rvrt is trained with own; leave --loss out"),
+        ("rvrt", {"loss": "l1"}, "loss=l1: rvrt is trained with own; leave loss= out"),
         ("unet", {"loss": "own"}, "trained with published or paper or l1 or scales-l1"),
-        ("mergenet", {"frames": 12}, "--frames 12: mergenet restores from 11 frames; leave --frames out"),
-        ("student-teacher", {"frames": 20}, "--frames 20: student-teacher learns from 11 frames; leave --frames out"),
-        ("bit2bit", {"schedule": "plateau"}, "--schedule plateau: follows validations, and bit2bit has none; leave it"),
+        ("mergenet", {"frames": 12}, "frames=12: mergenet restores from 11 frames; leave frames= out"),
+        ("student-teacher", {"frames": 20}, "frames=20: student-teacher learns from 11 frames; leave frames= out"),
+        ("bit2bit", {"schedule": "plateau"}, "schedule=plateau: follows validations, and bit2bit has none; leave it"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused_before_anything_is_written(
@@ -377,7 +377,7 @@ def test_batch_normalisation_of_memdeblur_needs_four_small_crops(tiny_dataset, t
     config = MemDeblurConfig(width=8, forward_blocks=1, backward_blocks=1, group_norm=False)
     network = MemDeblur(config)
     for batch in (1, 2, 3):
-        with pytest.raises(ValueError, match="give --batch 4"):
+        with pytest.raises(ValueError, match="give batch=4"):
             train(network, tiny_settings(network, tiny_dataset, tmp_path / "r", batch=batch), progress=False)
         assert not (tmp_path / "r").exists()
     network = MemDeblur(replace(config, group_norm=True))

@@ -38,9 +38,9 @@ def test_the_speed_is_found_for_any_scene(seed):
 
 
 def test_still_scenes_and_motions_out_of_reach_are_refused():
-    with pytest.raises(ValueError, match=r"wall: nothing in it moves, so --px 3 cannot be reached; leave --px out"):
+    with pytest.raises(ValueError, match=r"wall: nothing in it moves, so px=3 cannot be reached; leave px= out"):
         answer.speed_for(3.0, lambda speed: 0.0, "wall")
-    with pytest.raises(ValueError, match=r"snail: --px 3 cannot be reached; speed factor 1000 gives 0.5 px"):
+    with pytest.raises(ValueError, match=r"snail: px=3 cannot be reached; speed factor 1000 gives 0.5 px"):
         answer.speed_for(3.0, lambda speed: 5e-4 * speed, "snail")
 
 

@@ -56,7 +56,7 @@ def test_a_gain_belongs_to_the_bits_of_its_file(tmp_path, own):
     """The refusal names the depth at which the file is taken."""
     file = str(tmp_path / "mine.toml")
     (tmp_path / "mine.toml").write_text(QIS + own)
-    with pytest.raises(ValueError, match=r"belong to its 3 bits, and 1 are asked for; .* alone: --bits 3$"):
+    with pytest.raises(ValueError, match=r"belong to its 3 bits, and 1 are asked for; .* alone: bits=3$"):
         readouts(StudySettings(sensor=file), 0.65, 1e-4)
     planes, multibit = readouts(StudySettings(bits=(3,), sensor=file), 0.65, 1e-4)
     assert planes.sensor == BinarySPAD(0.3, 25.0, 1)
