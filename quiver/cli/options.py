@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
-import signal
-import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -88,15 +85,3 @@ def renew(folder: Path, mark: str, ours: str) -> None:
             shutil.rmtree(path)
         elif path.name != "lock":
             path.unlink()
-
-
-@contextlib.contextmanager
-def handling(handler: Callable[[int, Any], Any], *numbers: signal.Signals) -> Iterator[None]:
-    """Send signals to `handler` inside the block; in other threads than the main one nothing changes."""
-    main_thread = threading.current_thread() is threading.main_thread()
-    before = {number: signal.signal(number, handler) for number in numbers if main_thread}
-    try:
-        yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)

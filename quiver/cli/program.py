@@ -75,7 +75,7 @@ PROGRAM = Program(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line and return the exit code."""
-    from quiver.cli.options import handling
+    from quiver.cli.signals import handling
     from quiver.threads import wait_without_spinning
 
     wait_without_spinning()

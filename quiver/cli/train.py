@@ -19,7 +19,8 @@ from qsim.cli.options import check_free
 from qsim.files import Blocked, Damaged
 from qsim.kinds import Split
 from qsim.settings import setting
-from quiver.cli.options import handling, use_threads
+from quiver.cli.options import use_threads
+from quiver.cli.signals import handling
 from quiver.device import DEVICES
 from quiver.model.names import QUIVERS
 from quiver.restoration.interface import RestoreOptions

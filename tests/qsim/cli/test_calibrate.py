@@ -169,7 +169,7 @@ def test_an_efficiency_that_cannot_be_is_not_written_without_a_word(folder, caps
         assert ("above 1, and the sensor file holds 1: are photons" in capsys.readouterr().out) == odd
     (folder / "e.toml").unlink()
     assert main(["calibrate", *line.format("flat.npy", "dark.npy", 0.9).split()]) == 2
-    assert "hold no more counts than the dark frames; are --dark and --flat swapped" in capsys.readouterr().err
+    assert "hold no more counts than the dark frames; are dark and flat frames swapped" in capsys.readouterr().err
     assert not (folder / "e.toml").exists()
 
 

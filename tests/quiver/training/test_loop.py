@@ -318,7 +318,7 @@ def test_a_run_resumes_only_with_its_clips(tmp_path):
     lacks = f"{data}: the data set lacks 1 of its clips; a run resumes only with the clips that it began with, so"
     assert said[1:-1] == [f"{lacks} finish `qsim generate` first"]
     (tmp_path / "away.json").rename(record)
-    with pytest.raises(FileExistsError, match=r"a run on other clips or codes than .* choose another -o, or start"):
+    with pytest.raises(FileExistsError, match=r"a run on other clips or codes than .* choose another folder, or start"):
         train(small_network(), once, progress=False)
     said.clear()
     train(small_network(), once, progress=False, force=True, note=said.append)
