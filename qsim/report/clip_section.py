@@ -244,7 +244,7 @@ def unexpected(clip: Clip, stream: Stream) -> str | None:
         return "more than 64 codes"
     if stream.rows is not None:
         return "every row sees its own part of two frames of the clip"
-    if stream.shares is not None:
+    if not stream.timing.even:
         return "its codes have different exposures"
     if stream.info.planes_per_code > 1 or stream.info.planes_of or len(stream) != len(clip):
         return "a code sums planes of several frames of the clip"

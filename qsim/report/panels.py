@@ -152,7 +152,7 @@ def _inverse(stream: Stream, sensor: Sensor, samples: int) -> Callable[[NDArray[
 
     None for a sensor of more than _BITS bits or whose mean code does not rise, and for codes of different exposures.
     """
-    if stream.bits > _BITS or stream.shares is not None:
+    if stream.bits > _BITS or not stream.timing.even:
         return None
     try:
         response = sensor.response(stream.exposure)

@@ -50,6 +50,11 @@ class Timing:
             return rows
         return f"{rows}; exposures of {', '.join(f'{share:g}' for share in self.shares)} of a code's time in turn"
 
+    @property
+    def even(self) -> bool:
+        """Whether all codes have a full exposure of the clip's light."""
+        return self.shares is None
+
     def share(self, t: int) -> float:
         """Return the exposure of code t over a full one."""
         return 1.0 if self.shares is None else self.shares[t % len(self.shares)]

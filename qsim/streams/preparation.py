@@ -17,7 +17,6 @@ from qsim.sensor.defects.event_simulation import TOLERANCE, Effects
 from qsim.sensor.defects.pixel_array import PixelArray, require_effect
 from qsim.sensor.file_laws import Conditions
 from qsim.sensor.sensor import Sensor
-from qsim.streams.exposures import Timing
 from qsim.streams.photons import light_level
 from qsim.streams.sensing import Sensing, filters_of, frames_needed
 from qsim.streams.simulation import Draw
@@ -75,7 +74,7 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
     if sensing.exposures is not None:
         _check_exposures(sensing, sensor, found)
-    timing = Timing(planes, sensing.group, sensing.rows, sensing.exposures)
+    timing = sensing.timing(planes, sensing.group)
     draw = Draw(sensor, level, key, timing, sensing.diffraction, found, colour=filters)
     return dataclasses.replace(draw, origin=clip.origin)
 

@@ -15,6 +15,7 @@ from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.sensor import Sensor
 from qsim.settings import setting
+from qsim.streams.exposures import Timing
 from qsim.streams.rows import Rows
 
 
@@ -104,6 +105,10 @@ class Sensing:
     def rows(self) -> Rows | None:
         """The readout of rows or columns at their own time; None: all at once."""
         return None if self.row_delay is None else Rows(self.row_delay, self.row_order or "down")
+
+    def timing(self, frames: int, summed: bool) -> Timing:
+        """Return when codes collect light that take so many clip frames each, `summed` as planes or as slices."""
+        return Timing(frames, summed, self.rows, self.exposures)
 
     @property
     def stream_name(self) -> str:

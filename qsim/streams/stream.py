@@ -161,8 +161,7 @@ class Stream:
     def timing(self) -> Timing:
         """When codes collect light: clip frames, rows and schedule."""
         frames = self.info.planes_per_code
-        sensing = self.info.sensing
-        return Timing(frames, frames > 1 and self.sensor.sums_planes, sensing.rows, sensing.exposures)
+        return self.info.sensing.timing(frames, frames > 1 and self.sensor.sums_planes)
 
     @property
     def rows(self) -> Rows | None:
@@ -170,8 +169,8 @@ class Stream:
         return self.timing.rows
 
     def require_even(self, what: str) -> None:
-        """Raise `ValueError` if rows have their own time or codes different exposures, which `what` does not know."""
-        if self.rows is not None or self.shares is not None:
+        """Raise `ValueError` if rows have their own time or codes different light, which `what` does not know."""
+        if self.rows is not None or not self.timing.even:
             raise ValueError(f"{self.path}: {what} needs rows read at once and equal exposures; leave this stream out")
 
     def _existing(self, start: int, stop: int) -> range:
