@@ -74,7 +74,7 @@ def test_folders_of_files_do_not_make_another_stream():
 )
 def test_descriptions_that_cannot_be_are_refused(tmp_path, changes, message):
     values = records.plain(PLAIN) | {"format_version": 1} | changes
-    files.write_json(tmp_path / "s.json", files.sealed(values))
+    files.write_json(tmp_path / "s.json", descriptions.sealed(values))
     with pytest.raises(ValueError, match=rf"s\.json: .*{message}.*; mend it"):
         descriptions.read(tmp_path / "s.json", StreamInfo, "mend it")
 
