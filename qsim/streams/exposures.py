@@ -38,6 +38,7 @@ class Timing:
     summed: bool = False  # each of them is a plane of its own; otherwise all are slices of one exposure
     rows: Rows | None = None  # rows or columns at their own time; None: all at once
     shares: tuple[float, ...] | None = None  # exposures of codes in turn, over a full one; None: all are full
+    drift: float = 0.0  # rise of the light from the first code to the last, over that of the first
 
     def over(self, clip: ClipFolder) -> Exposures:
         """Return the exposures of the codes that a clip gives."""
@@ -46,6 +47,8 @@ class Timing:
     def words(self) -> str:
         """Return what differs from equal exposures of all rows at once: `; each row 2e-06 s later, down`, or ``."""
         rows = "" if self.rows is None else f"; {self.rows}"
+        if self.drift:
+            rows += f"; light changes by {100 * self.drift:+g} % to the last code"
         if self.shares is None:
             return rows
         return f"{rows}; exposures of {', '.join(f'{share:g}' for share in self.shares)} of a code's time in turn"
@@ -53,7 +56,7 @@ class Timing:
     @property
     def even(self) -> bool:
         """Whether all codes have a full exposure of the clip's light."""
-        return self.shares is None
+        return self.shares is None and self.drift == 0
 
     def share(self, t: int) -> float:
         """Return the exposure of code t over a full one."""
@@ -87,11 +90,16 @@ class Exposures:
     def __getitem__(self, t: int) -> tuple[Exposure, ...]:
         """Return the exposures of code t: one, or one for each plane that it sums."""
         share = self.timing.share(t)
+        strength = self.strength(t)
         first = t * self.timing.frames
         numbers = range(first, first + self.timing.frames)
         if self.timing.summed:
-            return tuple(self._of(range(n, n + 1), np.array([share]), share) for n in numbers)
-        return (self._of(numbers, gate(share, self.timing.frames), share),)
+            return tuple(self._of(range(n, n + 1), np.array([share * strength]), share) for n in numbers)
+        return (self._of(numbers, gate(share, self.timing.frames) * strength, share),)
+
+    def strength(self, t: int) -> float:
+        """Return the light of code t over that of the clip: 1 + drift t / (T - 1) of T codes."""
+        return 1.0 + self.timing.drift * t / max(len(self) - 1, 1)
 
     def _of(self, frames: range, parts: Array, share: float) -> Exposure:
         """Return the exposure of clip frames that is open for a share of their time, around its middle."""

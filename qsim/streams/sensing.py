@@ -9,7 +9,7 @@ from typing import Annotated
 
 from qsim import files, records
 from qsim.files import check_name
-from qsim.kinds import Bits, Frames, Light, Name, Number, Positive, RowOrder, Schedule, Seed, Text
+from qsim.kinds import Bits, Frames, Light, Name, Number, Positive, Rise, RowOrder, Schedule, Seed, Text
 from qsim.sensor import colour_filter, devices
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.defects.defect_table import Defects
@@ -74,6 +74,9 @@ class Sensing:
             unset="all of it",
         ),
     ] = None
+    light_drift: Annotated[
+        Rise, setting("rise of the light from the first code to the last, as a share: a lamp that warms up")
+    ] = 0.0
     follow: Annotated[bool, setting("counting SPAD: draw photon by photon, so that their times are known")] = False
     temperature: Annotated[
         Number | None,
@@ -108,7 +111,7 @@ class Sensing:
 
     def timing(self, frames: int, summed: bool) -> Timing:
         """Return when codes collect light that take so many clip frames each, `summed` as planes or as slices."""
-        return Timing(frames, summed, self.rows, self.exposures)
+        return Timing(frames, summed, self.rows, self.exposures, self.light_drift)
 
     @property
     def stream_name(self) -> str:

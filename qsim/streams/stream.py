@@ -148,7 +148,7 @@ class Stream:
         def sharp(frame: int, crop: Crop | None = None) -> Array:
             return clip_photons(clip, frame, factor, crop, sharp=True)
 
-        return np.stack([exposures.middle(sharp, t, at) for t in frames])
+        return np.stack([exposures.middle(sharp, t, at) * exposures.strength(t) for t in frames])
 
     def known(self) -> Array | None:
         """Return bool [T, H, W], False where light of `truth` is cut off (`Clip.saturated`); None if all is known."""
