@@ -58,5 +58,5 @@ def test_the_command_has_the_option(clip, capsys):
 
 
 def test_it_is_bounded_in_python_too():
-    with pytest.raises(ValueError, match="light_drift: expected a number from -0.9 to 10, got 11"):
+    with pytest.raises(ValueError, match=r"light_drift: expected a number from -0\.9 to 10, got 11"):
         Sensing("quiver-physical", light_drift=11)
