@@ -29,7 +29,7 @@ Owner = TypeVar("Owner")
 Answer = TypeVar("Answer")
 
 
-def setting(
+def setting(  # noqa: PLR0913 (settings of a public function)
     words: str,
     *,
     unit: str = "",

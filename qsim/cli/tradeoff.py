@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -183,9 +184,7 @@ def tradeoff(asked: Tradeoff) -> int:
 def _tradeoff_study(asked: Tradeoff) -> int:
     from qsim.clip.motion_statistics import SLOWEST
     from qsim.studies.bit_depth import clips as study_clips
-    from qsim.studies.bit_depth import figures, speed_sweep
-    from qsim.studies.bit_depth.answer import WIDEST, answer, widened
-    from qsim.studies.bit_depth.clip_study import study
+    from qsim.studies.bit_depth.answer import WIDEST
     from qsim.studies.bit_depth.readout import StudySettings
 
     bits = tuple(asked.bits or (1, 2, 3, 4, 5))
@@ -216,47 +215,74 @@ def _tradeoff_study(asked: Tradeoff) -> int:
         progress = _both(shown, rendering)
         clips = list(study_clips.clips_for(asked.named, speeds, shape, asked.output, progress))
     first = clips[0].clip
-    if asked.streams and clips[0].step > 1:
-        raise ValueError("--streams: writes a clip at its own speed; leave out --speed and --px, or name a scene")
-    if first.camera is None and not asked.ppp:
-        raise ValueError(f"{first.path}: its radiance is relative; give the light with --ppp, as in --ppp 0.65")
-    if asked.streams:  # refused before the study, not after it
-        for depth in range(1, WIDEST + 1) if widen else settings.bits:
-            study_clips.stream_clip(first, asked.folder / "streams", depth, asked.force)
-    text: list[str] = []
+    _check_rendered(asked, first, clips[0].step, [*range(1, WIDEST + 1)] if widen else settings.bits)
     with bar("drawing", "study" if swept else "frame") as shown:
         if swept:
-            ppps = asked.ppp or [first.mean_photons]
-            drawing = TimeForecast(f"drawing {len(speeds) * len(ppps)} studies", note, unit="study")
-            progress = _both(shown, drawing)
-            found = speed_sweep.sweep(clips, ppps, settings, widen=widen, progress=progress)
-            result = found.to_dict()
-            pictures = {"best.png": figures.sweep_figure(found)}
-            text += [line for row in found.studies for one in row for line in speed_sweep.table(one)]
-            text.append(speed_sweep.summary(found))
-            answers = found.answers
+            done = _sweep(clips, asked.ppp or [first.mean_photons], settings, widen, shown)
         else:
-            chosen = replace(settings, ppp=levels[0], speed=clips[0].step)
-            progress = _both(shown, TimeForecast("drawing the study", note, unit="frame"))
-            one = widened(first, chosen, note) if widen else study(first, chosen, progress=progress)
-            result = speed_sweep.study_dict(one)
-            pictures = {"tradeoff.png": figures.study_figure(one)}
-            text += speed_sweep.table(one)
-            settings = replace(settings, bits=one.bits)
-            answers = [answer(one)]
+            done = _single(first, replace(settings, ppp=levels[0], speed=clips[0].step), widen, shown)
+    result = done.result
+    text = done.text
     if asked.px:
         result["px_asked"], result["speeds_found"] = asked.px, speeds
         text = [f"--px {px:g}: speed factor {speed:g}" for px, speed in zip(asked.px, speeds, strict=True)] + text
     if asked.streams:
         running().after_interrupt = MAKES_AGAIN
-        lit = replace(settings, ppp=levels[0])
+        lit = replace(settings, ppp=levels[0], bits=done.bits)
         made = study_clips.write_streams(first, asked.folder / "streams", lit, force=asked.force)
         result["streams"] = [str(path) for path in made]
         text += [f"streams 'planes' and 'multibit': {path}" for path in made]
     if asked.output is not None:
-        text += _write_study(asked.folder, "tradeoff.json", result, pictures)
-    output(result, text + answers)
+        text += _write_study(asked.folder, "tradeoff.json", result, done.pictures)
+    output(result, text + done.answers)
     return 0
+
+
+@dataclass
+class _Done:
+    """What a study found: numbers, pictures by name, lines of its table, and its answers."""
+
+    result: dict[str, Any]
+    pictures: dict[str, Any]
+    text: list[str]
+    answers: list[str]
+    bits: tuple[int, ...]
+
+
+def _check_rendered(asked: Tradeoff, first: Any, step: int, depths: Sequence[int]) -> None:
+    """Raise `ValueError` or `FileExistsError` for what a clip shows to be impossible, before the study."""
+    from qsim.studies.bit_depth import clips as study_clips
+
+    if asked.streams and step > 1:
+        raise ValueError("--streams: writes a clip at its own speed; leave out --speed and --px, or name a scene")
+    if first.camera is None and not asked.ppp:
+        raise ValueError(f"{first.path}: its radiance is relative; give the light with --ppp, as in --ppp 0.65")
+    if asked.streams:
+        for depth in depths:
+            study_clips.stream_clip(first, asked.folder / "streams", depth, asked.force)
+
+
+def _sweep(clips: list[Any], ppps: list[float], settings: Any, widen: bool, shown: Progress) -> _Done:
+    """Study every speed at every light level."""
+    from qsim.studies.bit_depth import figures, speed_sweep
+
+    drawing = TimeForecast(f"drawing {len(clips) * len(ppps)} studies", note, unit="study")
+    found = speed_sweep.sweep(clips, ppps, settings, widen=widen, progress=_both(shown, drawing))
+    text = [line for row in found.studies for one in row for line in speed_sweep.table(one)]
+    text.append(speed_sweep.summary(found))
+    return _Done(found.to_dict(), {"best.png": figures.sweep_figure(found)}, text, found.answers, settings.bits)
+
+
+def _single(first: Any, settings: Any, widen: bool, shown: Progress) -> _Done:
+    """Study one clip at one light level."""
+    from qsim.studies.bit_depth import figures, speed_sweep
+    from qsim.studies.bit_depth.answer import answer, widened
+    from qsim.studies.bit_depth.clip_study import study
+
+    progress = _both(shown, TimeForecast("drawing the study", note, unit="frame"))
+    one = widened(first, settings, note) if widen else study(first, settings, progress=progress)
+    pictures = {"tradeoff.png": figures.study_figure(one)}
+    return _Done(speed_sweep.study_dict(one), pictures, speed_sweep.table(one), [answer(one)], one.bits)
 
 
 def _clips(count: int) -> str:

@@ -104,33 +104,45 @@ class Program:
     def _wrong(self, error: CycloptsError) -> str:
         """Return what is wrong with a command line."""
         unused = (error.unused_tokens or [""])[0]
-        if isinstance(error, UnknownCommandError) and not unused.startswith("-"):
-            return f"unknown command '{unused}'{suggest(unused, self.commands)}; there are: {', '.join(self.commands)}"
-        if isinstance(error, UnknownCommandError):
-            return f"unknown option {unused}{suggest(unused, ('--help', '--version'))}"
-        if isinstance(error, UnknownOptionError):
-            return self._unknown_option(error.token.keyword or error.token.value, error)
-        if isinstance(error, MissingArgumentError):  # its name may be misspelt
-            for word in error.unused_tokens or ():
-                if word.startswith("--") and word.split("=")[0] not in self._options(error):
-                    return self._unknown_option(word, error)
-        if isinstance(error, UnusedCliTokensError):
-            return f"unexpected argument {unused}"
-        argument = _name_of(error)
-        if isinstance(error, MissingArgumentError):
-            if argument.startswith("-") and (error.keyword or (error.argument and error.argument.tokens)):
-                return f"argument {argument}: needs a value"
-            return f"the following arguments are required: {argument}"
-        if isinstance(error, RepeatArgumentError):
-            return f"argument {error.token.keyword}: not allowed with its opposite; leave one of them out"
-        if isinstance(error, CoercionError) and error.msg is not None:
-            return f"argument {argument}: {error.msg}"
-        choices = error.argument.parameter.choices if error.argument is not None else None
-        if isinstance(error, CoercionError) and error.token is not None and isinstance(choices, tuple):
-            return f"argument {argument}: {no_choice(error.token.value, choices)}"
-        if isinstance(error, CoercionError) and error.token is not None:
-            return f"argument {argument}: takes no value, got {error.token.value!r}"
+        match error:
+            case UnknownCommandError() if unused.startswith("-"):
+                return f"unknown option {unused}{suggest(unused, ('--help', '--version'))}"
+            case UnknownCommandError():
+                known = ", ".join(self.commands)
+                return f"unknown command '{unused}'{suggest(unused, self.commands)}; there are: {known}"
+            case UnknownOptionError():
+                return self._unknown_option(error.token.keyword or error.token.value, error)
+            case MissingArgumentError():
+                return self._missing(error)
+            case UnusedCliTokensError():
+                return f"unexpected argument {unused}"
+            case RepeatArgumentError():
+                return f"argument {error.token.keyword}: not allowed with its opposite; leave one of them out"
+            case CoercionError():
+                return self._unfit(error)
         return " ".join(str(error).split())
+
+    def _missing(self, error: MissingArgumentError) -> str:
+        """Return the sentence about an argument that is not given, or whose name is misspelt."""
+        for word in error.unused_tokens or ():
+            if word.startswith("--") and word.split("=")[0] not in self._options(error):
+                return self._unknown_option(word, error)
+        argument = _name_of(error)
+        if argument.startswith("-") and (error.keyword or (error.argument and error.argument.tokens)):
+            return f"argument {argument}: needs a value"
+        return f"the following arguments are required: {argument}"
+
+    def _unfit(self, error: CoercionError) -> str:
+        """Return the sentence about a value that does not fit its argument."""
+        argument = _name_of(error)
+        if error.msg is not None:
+            return f"argument {argument}: {error.msg}"
+        if error.token is None:
+            return " ".join(str(error).split())
+        choices = error.argument.parameter.choices if error.argument is not None else None
+        if isinstance(choices, tuple):
+            return f"argument {argument}: {no_choice(error.token.value, choices)}"
+        return f"argument {argument}: takes no value, got {error.token.value!r}"
 
     def _options(self, error: CycloptsError) -> list[str]:
         """Return every option of the command that an error is about."""

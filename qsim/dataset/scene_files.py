@@ -153,10 +153,7 @@ def _follow(path: Path, folders: list[Path], defaults: dict[str, str], found: se
     found.add(path)
     if len(found) > MOST_FILES:
         raise ValueError(f"{path}: a scene that names more than {MOST_FILES} files")
-    try:
-        elements = list(ElementTree.parse(path).iter())
-    except (ElementTree.ParseError, OSError, ValueError):
-        return  # Mitsuba reports the error
+    elements = _elements(path)
     if _plain(path.parent) not in folders:
         folders.append(_plain(path.parent))
     for element in elements:
@@ -170,6 +167,14 @@ def _follow(path: Path, folders: list[Path], defaults: dict[str, str], found: se
                 _follow(file, folders, defaults, found)
             else:
                 found.add(file)
+
+
+def _elements(path: Path) -> list[ElementTree.Element]:
+    """Return the elements of an XML file; none of a file that is none, about which Mitsuba reports."""
+    try:
+        return list(ElementTree.parse(path).iter())
+    except (ElementTree.ParseError, OSError, ValueError):
+        return []
 
 
 def _add_folders(path: Path, value: str, folders: list[Path]) -> None:

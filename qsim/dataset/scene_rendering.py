@@ -26,7 +26,7 @@ from qsim.scenes.colours import coloured
 from qsim.streams.clip import Clip
 
 
-def render(
+def render(  # noqa: PLR0913 (settings of a public function)
     scene: Scene | str | os.PathLike[str],
     path: str | os.PathLike[str] | None = None,
     *,

@@ -200,29 +200,9 @@ def to_stream(
         raise ValueError(
             f"{path}: {recording.format} holds light, not codes; name a clip folder to make, as in out/clip"
         )
-    if capture.split is not None:
-        raise ValueError(f"{path}: split= is stored in clips, and {recording.format} becomes a stream; leave it out")
-    if capture.ppp is not None and capture.sensor is None:
-        raise ValueError(f"{path}: ppp= sets the gain of a named sensor; name it with sensor=, or leave ppp= out")
-    device = devices.DEVICES.get(str(capture.sensor))
-    if capture.ppp is not None and not (device is not None and device.follows_light):
-        raise ValueError(f"{path}: ppp= changes nothing for {capture.sensor}, whose gain is fixed; leave it out")
-    check_outside(path)
-    stem = path.with_suffix("") if path.suffix in (".npy", ".json") else path
-    npy, description = (stem.with_name(f"{stem.name}{end}") for end in (".npy", ".json"))  # a stem may hold dots
-    for file in (npy, description):
-        if file.exists() and not force:
-            raise FileExistsError(f"{file}: exists; name another, or replace it with force=True")
-        if file.exists() and (not description.is_file() or not is_stream(description)):
-            raise FileExistsError(
-                f"{file}: is not a stream, which is all that is replaced; move it away, or name another"
-            )
+    _check_stream(path, recording, capture)
+    npy = _free_stream(path, force)
     frames, height, width = recording.shape
-    if recording.source.bitplanes is not None:
-        raise ValueError(
-            f"{path}: sums of {recording.source.bitplanes} bitplanes; codes of a stream are sums of 2^b - 1, as 3, "
-            "7 or 15"
-        )
     capture = _as_stated(path, recording, capture)
     sensor, tables = _tables(capture, _sensor(recording, capture), height, width)
     model = recording.code_model if sensor.sums_planes else sensor.code_model
@@ -248,6 +228,37 @@ def to_stream(
         **tables,
     )
     return write_packed(npy, packed(), info)
+
+
+def _check_stream(path: Path, recording: Recording, capture: Import) -> None:
+    """Raise `ValueError` for what a stream cannot state, and for sums that are no codes of it."""
+    if capture.split is not None:
+        raise ValueError(f"{path}: split= is stored in clips, and {recording.format} becomes a stream; leave it out")
+    if capture.ppp is not None and capture.sensor is None:
+        raise ValueError(f"{path}: ppp= sets the gain of a named sensor; name it with sensor=, or leave ppp= out")
+    device = devices.DEVICES.get(str(capture.sensor))
+    if capture.ppp is not None and not (device is not None and device.follows_light):
+        raise ValueError(f"{path}: ppp= changes nothing for {capture.sensor}, whose gain is fixed; leave it out")
+    if recording.source.bitplanes is not None:
+        raise ValueError(
+            f"{path}: sums of {recording.source.bitplanes} bitplanes; codes of a stream are sums of 2^b - 1, as 3, "
+            "7 or 15"
+        )
+
+
+def _free_stream(path: Path, force: bool) -> Path:
+    """Return the file of a stream's codes; `FileExistsError` if it or its description exists and is not replaced."""
+    check_outside(path)
+    stem = path.with_suffix("") if path.suffix in (".npy", ".json") else path
+    npy, description = (stem.with_name(f"{stem.name}{end}") for end in (".npy", ".json"))  # a stem may hold dots
+    for file in (npy, description):
+        if file.exists() and not force:
+            raise FileExistsError(f"{file}: exists; name another, or replace it with force=True")
+        if file.exists() and (not description.is_file() or not is_stream(description)):
+            raise FileExistsError(
+                f"{file}: is not a stream, which is all that is replaced; move it away, or name another"
+            )
+    return npy
 
 
 def _as_stated(path: Path, recording: Recording, capture: Import) -> Import:

@@ -17,7 +17,7 @@ from qsim.scene import Scene
 from qsim.streams.clip import Clip
 
 
-def render_clip(
+def render_clip(  # noqa: PLR0913 (settings of a public function)
     scene: Scene,
     path: str | os.PathLike[str],
     *,

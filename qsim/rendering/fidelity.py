@@ -63,7 +63,7 @@ class Noise:
         return Errors(*(_error(errors, samples) / math.sqrt(instants) for errors in (self.at_white, self.plain)))
 
 
-def choose_budget(
+def choose_budget(  # noqa: PLR0913 (settings of a public function)
     scene: Scene,
     *,
     frame_rate: float = 2000.0,

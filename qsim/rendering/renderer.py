@@ -79,7 +79,7 @@ class Renderer:
     """
 
     @one_thread_at_a_time
-    def __init__(
+    def __init__(  # noqa: PLR0913 (settings of a public function)
         self,
         scene: Scene,
         *,

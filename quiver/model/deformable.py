@@ -33,7 +33,7 @@ def warp(image: Tensor, flow: Tensor, padding: Literal["zeros", "border"] = "zer
         return sample_at(image, x, y, padding)
 
 
-def deform_conv2d(
+def deform_conv2d(  # noqa: PLR0913 (settings of a public function)
     image: Tensor,
     offset: Tensor,
     weight: Tensor,

@@ -21,7 +21,7 @@ from quiver.restoration.sources import codes_of, refuse_idle
 Source = Stream | Clip | str | os.PathLike[str] | Array
 
 
-def restore(
+def restore(  # noqa: PLR0913 (settings of a public function)
     source: Source | LazyArray,
     method: str = DEFAULT_METHOD,
     *,
@@ -79,15 +79,9 @@ def restore(
 
 def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: float | None) -> Codes:
     if isinstance(source, np.ndarray):
-        if sensor is None or exposure is None:
-            raise ValueError("an array of codes has no sensor and no exposure; give sensor= and exposure= in seconds")
         if ppp is not None:
             raise ValueError("ppp= is for a clip that is sensed now, and an array holds codes already; leave it out")
-        if not isinstance(sensor, Sensor):
-            raise ValueError(f"sensor= is a sensor, as qsim.load_sensor(NAME, ...) returns it, got {sensor!r}")
-        if not 0 < exposure < float("inf"):
-            raise ValueError(f"exposure= is in seconds and above 0, got {exposure!r}")
-        return array_codes(source, sensor, exposure)
+        return _array(source, sensor, exposure)
     if sensor is not None or exposure is not None:
         raise ValueError("sensor= and exposure= are for arrays, and a clip or a stream has its own; leave them out")
     if isinstance(source, str | os.PathLike):
@@ -107,3 +101,14 @@ def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: f
             f"{source.path}: give one of its streams ({there}) as clip.stream(NAME), or ppp= to sense it now"
         )
     return stream_codes(source.stream(source.streams[0]))
+
+
+def _array(codes: Array, sensor: Sensor | None, exposure: float | None) -> Codes:
+    """Return the codes of an array [T, H, W]; `ValueError` for what is no sensor, and no exposure [s]."""
+    if sensor is None or exposure is None:
+        raise ValueError("an array of codes has no sensor and no exposure; give sensor= and exposure= in seconds")
+    if not isinstance(sensor, Sensor):
+        raise ValueError(f"sensor= is a sensor, as qsim.load_sensor(NAME, ...) returns it, got {sensor!r}")
+    if not 0 < exposure < float("inf"):
+        raise ValueError(f"exposure= is in seconds and above 0, got {exposure!r}")
+    return array_codes(codes, sensor, exposure)
