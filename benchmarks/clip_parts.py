@@ -15,8 +15,6 @@ from statistics import median
 from typing import Any
 from unittest import mock
 
-import drjit as dr
-
 from qsim import records
 
 REST = "rest"
@@ -33,6 +31,8 @@ class Parts:
 
     def turn(self) -> None:
         """Count the time since the last turn for the part that is open; launched kernels finish first."""
+        import drjit as dr  # not before qsim has chosen its library
+
         dr.sync_thread()
         now = time.process_time()
         self.seconds[self._open[-1]] += now - self._since

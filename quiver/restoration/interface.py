@@ -10,7 +10,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.files import Progress
-from qsim.kinds import Count
+from qsim.kinds import Whole
 from qsim.settings import setting, settle
 from qsim.words import memory_size
 from quiver.data.codes import Codes, light_of
@@ -37,7 +37,7 @@ class RestoreOptions:
     """
 
     memory: Annotated[
-        Count | None,
+        Whole | None,
         setting(
             "working memory, as in 500MB",
             unset="2GB; on a GPU half of its memory for networks other than mergenet",

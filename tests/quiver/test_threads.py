@@ -16,11 +16,11 @@ from clips import ClipMaker, write_clip
 from compiled_cases import loaded_drjit
 
 import qsim.cli.program
-from qsim.streams import sensing
+from qsim.streams import storing
 from quiver import threads
 from quiver.cli import program
 from quiver.model.unet import UNet, UNetConfig
-from quiver.restoration.restored_file import FORMAT
+from quiver.restoration.restored_file import Unfinished
 from quiver.training.loop import train
 from quiver.training.settings import Settings
 
@@ -159,7 +159,7 @@ def test_restored_video_notes_its_number(make_clip: ClipMaker, tmp_path, capsys)
 
     assert noted("--threads", 2) == 2
     assert noted("--threads", 1) == 1
-    (tmp_path / "v.npy.part.json").write_text(json.dumps({"format": FORMAT, "threads": 2}))
+    (tmp_path / "v.npy.part.json").write_text(json.dumps({"format": Unfinished.FORMAT, "threads": 2}))
     assert noted() == 2
 
 
@@ -186,13 +186,13 @@ def test_the_compiled_engine_has_as_many_and_the_next_command_all(tmp_path, monk
     drjit = loaded_drjit()
     before = drjit.thread_count()
     seen = []
-    plain = sensing.sense
+    plain = storing.sense
 
     def watched(*args: object, **kwargs: object) -> object:
         seen.append((os.environ.get("QSIM_THREADS"), drjit.thread_count()))
         return plain(*args, **kwargs)
 
-    monkeypatch.setattr(sensing, "sense", watched)
+    monkeypatch.setattr(storing, "sense", watched)
     clip = write_clip(tmp_path / "c", frames=3, height=96, width=96)
     for name, more in (("one", ["--threads", "1"]), ("all", [])):
         assert qsim.cli.program.main(["sense", str(clip.path), "--ppp", "3", "--bits", "3", "-o", name, *more]) == 0

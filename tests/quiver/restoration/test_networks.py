@@ -126,9 +126,9 @@ def test_the_stated_look_ahead_is_that_of_the_mode(mode, ahead):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"mode": "fast"}, "mode 'fast'; known are exact, streaming, windows"),
-        ({"precision": "float16"}, "precision 'float16'"),
-        ({"memory": 0}, "memory is in bytes and above 0"),
+        ({"mode": "fast"}, "mode: expected one of exact, streaming, windows, got 'fast'"),
+        ({"precision": "float16"}, "precision: expected one of float32, bfloat16, got 'float16'"),
+        ({"memory": 0}, "memory: expected a whole number from 1, got 0"),
     ],
 )
 def test_bad_options_are_named(changes, message):
