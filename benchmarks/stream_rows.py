@@ -86,7 +86,7 @@ def learned(name: str, rate: str, minutes: float, clip: Clip, args: argparse.Nam
     copy = args.work / f"{name}_clips" / clip.name
     folder = args.work / f"{name}_{clip.name}_{rate}"
     shutil.copytree(clip.path, copy, dirs_exist_ok=True)
-    sense(Clip.open(copy), LIGHT.sensing(0))
+    sense(Clip.open(copy), LIGHT.sensing)
     frames = min(FRAMES, len(clip) // 8 * 8)
     quiver(
         *("train", copy, "-o", folder, "--preset", name, "--device", "cpu", "--minutes", minutes),

@@ -16,6 +16,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
+from quiver.device import DEVICES
+
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
 
@@ -38,7 +40,7 @@ def numbers() -> Iterator[None]:
 
     with ExitStack() as stack:
         stack.enter_context(np.errstate(divide="warn", over="warn", invalid="warn", under="ignore"))
-        for device in ("cpu", "cuda"):
+        for device in DEVICES[1:]:
             if torch.is_autocast_enabled(device):
                 stack.enter_context(torch.autocast(device, enabled=False))
         if torch.get_default_dtype() is not torch.float32:

@@ -58,6 +58,7 @@ class Running:
     """The command that runs: how it prints, and what an interruption leaves."""
 
     program: Program | None = None
+    command: Command | None = None
     printing: Printing = field(default_factory=Printing)
     threads: int | None = None
     target: Path | None = None  # the file or folder that it makes
@@ -112,6 +113,7 @@ def _run(program: Program, words: Sequence[str]) -> int:
     outputs = [values.get(setting.name) for setting in command.settings if setting.option == "output"]
     state = Running(
         program=program,
+        command=command,
         printing=printing,
         threads=values.get("threads"),
         target=next((Path(output) for output in outputs if output), None),
@@ -199,11 +201,19 @@ def _warnings_as_lines(prog: str) -> Iterator[None]:
     """Print each warning as one line on stderr, without its place in the source; none with --quiet."""
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
-        note(f"{prog}: warning: {' '.join(str(message).split())}")
+        note(f"{prog}: warning: {in_options(' '.join(str(message).split()))}")
 
     with warnings.catch_warnings():
         warnings.showwarning = show
         yield
+
+
+def in_options(text: str) -> str:
+    """Return a text of the library with the options of the running command in place of arguments."""
+    state = running()
+    if state.program is None or state.command is None:
+        return text
+    return state.command.in_options(ValueError(text), text, state.program.options)
 
 
 def note(text: str) -> None:

@@ -14,7 +14,7 @@ from msgspec import Meta
 from qsim.cli import documented_keys
 from qsim.cli.command import Idle, command
 from qsim.cli.completion import recipes as recipe_names
-from qsim.cli.console import PILOT, RESUMES, bar, note, output, running
+from qsim.cli.console import PILOT, RESUMES, bar, in_options, note, output, running
 from qsim.dataset.job import Job
 from qsim.dataset.recipe import Recipe
 from qsim.kinds import Frames, NotNegative, Positive, Text, Whole
@@ -273,5 +273,5 @@ def check(asked: Check) -> int:
     if asked.redraw:
         facts["redrawn"] = [dataclasses.asdict(one) | {"path": str(one.path), "wrong": one.wrong} for one in again]
         lines += checking.redrawn_lines(again)
-    output(facts, lines)
+    output(facts, [in_options(line) for line in lines])
     return 1 if problems or any(one.wrong for one in again) else 0

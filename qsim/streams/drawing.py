@@ -58,7 +58,7 @@ class Drawer(ABC):
                 progress(done, frames)
 
     def packed_blocks(self, frames: int, step: int) -> Iterator[Array]:
-        """Yield the same without a call of progress."""
+        """Yield the same without a call of progress: uint8 [t, H, ceil(W bits / 8)]."""
         return (packing.pack(block, self.sensor.bits) for block in self.blocks(0, frames, step))
 
     @property

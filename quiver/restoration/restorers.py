@@ -55,7 +55,10 @@ def restorer(name: str, options: RestoreOptions | None = None) -> Restorer:
         memory = options.bound(host=True)
         if taken > memory:
             size = f"{codes.shape[1]} x {codes.shape[2]} px"
-            warnings.warn(f"{name} takes about {taken / 1e6:.0f} MB for a frame of {size}, above memory=", stacklevel=2)
+            warnings.warn(
+                f"{name} takes about {taken / 1e6:.0f} MB for a frame of {size}, above memory={memory}",
+                stacklevel=2,
+            )
         free = memory - taken
         if codes.shares is None:
             fill_classical(run, frames, codes, out, first, free, progress)
@@ -132,7 +135,7 @@ def weights_path(name: str) -> Path:
         )
     if name in NETWORKS:
         raise ValueError(
-            f"{name}: a network without shipped weights; train it with `quiver train` and preset={name} and name FOLDER"
+            f"{name}: a network without shipped weights; train it (`quiver train`), and name the folder of the run"
         )
     raise ValueError(
         f"no method {name!r}{suggest(name, (*method_names(), *NETWORKS))}; known are {', '.join(method_names())}, a "

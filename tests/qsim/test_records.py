@@ -150,7 +150,7 @@ def test_settings_are_the_declared_fields():
     assert list(found) == ["sensor", "bits", "light_level", "shares", "group"]
     assert found["sensor"].required
     assert found["bits"].help_with_default == "bits per code (default: the sensor's own)"
-    assert found["light_level"].help_with_default == "mean photons (default 3.25)"
+    assert found["light_level"].help_with_default == "mean photons [photons/px] (default 3.25)"
     assert found["light_level"].option == "light-level"
     assert found["group"].help_with_default == "sum planes"
     assert found["bits"].short == "b"

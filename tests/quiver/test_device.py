@@ -83,5 +83,5 @@ def test_working_memory_is_half_of_a_gpu_for_what_runs_there(monkeypatch):
     for stated in (1, 3 * 10**9):
         options = RestoreOptions(memory=stated)
         assert options.bound() == options.bound(host=True) == stated
-    with pytest.raises(ValueError, match="memory is in bytes and above 0, got 0"):
+    with pytest.raises(ValueError, match="memory: expected a whole number from 1, got 0"):
         RestoreOptions(memory=0)

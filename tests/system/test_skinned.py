@@ -107,5 +107,5 @@ def test_a_damaged_file_is_one_line_and_nothing_is_left(command, tmp_path, capsy
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert "arm.glb: truncated: " in lines[0]
-    assert ("t.toml:8: " in lines[0]) == (command == "generate")
+    assert ("t.toml: scenes[0]: " in lines[0]) == (command == "generate")
     assert not (tmp_path / "out").exists()

@@ -154,7 +154,7 @@ def _of_model(found: Study, model: str) -> str:
     text = f"{model} {marked(found, model)} bit{'s' if best.bits > 1 else ''}{worse}"
     if edge == ">=":
         text += " (the deepest tried"
-        text += f": try bits=1,...,{min(best.bits + 2, 10)})" if best.bits < 10 else ")"
+        text += f": try bits 1,...,{min(best.bits + 2, 10)})" if best.bits < 10 else ")"
     if edge == "<=":
-        text += " (the shallowest tried: try bits=1,...)"
+        text += " (the shallowest tried: try bits 1,...)"
     return text

@@ -204,7 +204,10 @@ def test_an_edited_recipe_is_refused_after_its_manifest_was_lost(tmp_path: Path,
     generate(SMALL, folder, HERE, make=make)
     edited = recipe.parse(RECIPE.replace("frames = 2", "frames = 2\npsnr = 30"))
     (folder / "dataset.json").unlink()
-    with pytest.raises(ValueError, match="clip tumble_0004 was made with other settings; use another folder, or --"):
+    with pytest.raises(
+        ValueError,
+        match="other settings; use another folder, or make it again with repair=True",
+    ):
         generate(edited, folder, HERE, make=make)
     assert not (folder / "dataset.json").exists()
     assert generate(SMALL, folder, HERE, make=make) == Summary(3, 3, 0, {}, ())

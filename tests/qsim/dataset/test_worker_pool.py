@@ -49,7 +49,7 @@ def test_a_killed_parent_leaves_no_workers_and_its_folder_resumes(tmp_path: Path
 
 @pytest.mark.parametrize(
     ("maker", "why"),
-    [(crash_on_tumble, "signal SIGKILL"), (hoard_on_tumble, "more memory than --memory")],
+    [(crash_on_tumble, "signal SIGKILL"), (hoard_on_tumble, "more memory than is allowed")],
 )
 def test_a_crashing_worker_takes_down_only_its_job(tmp_path: Path, maker: RenderJob, why: str):
     options = Options(workers=2, limits=Limits(memory=0.7))

@@ -88,7 +88,7 @@ def test_the_section_states_light_motion_model_and_error(tmp_path):
     page = report.build_page(clip.path)
     assert f"{clip.mean_photons:.4g} photons per pixel and exposure" in page
     assert f"3.25 photons per pixel (the clip&#39;s light × {stream.photons_factor:.4g}), equal to 1.313 lx" in page
-    assert "2.6 e⁻ per pixel; 3 bit, QIS (multibit): quantum_efficiency 0.8 e-/photon" in page
+    assert "2.6 e⁻ per pixel; 3 bit, QIS (multibit): bits 3, dark_current 1.6 e-/s, gain 1 codes/e-" in page
     assert '<td>bounces</td><td class="number">2</td><td>later ones &lt;1 %</td>' in page
     assert "Error of a frame (noise, blur, omitted bounces): 0.01 rms in the unit of the radiance, worst 0.01" in page
     for words in ("light of the truth", "drawn, and expected from the light", "error of every frame"):

@@ -189,6 +189,10 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         "--sensor", "quiver-published", Refused(TRAIN, "--sensor carries.toml", "training windows cannot follow")
     ),
     ("train", "--ppp"): of_training("--ppp", "9"),
+    ("train", "--temperature"): [
+        Refused(TRAIN, "--temperature 30", "temperature"),
+        Refused(f"{TRAIN} --sensor spad-320x240", "--temperature 30", "no law of temperature"),
+    ],
     ("train", "--bits"): of_training(
         "--bits", "1", Refused(f"{TRAIN} --sensor spad.toml", "--bits 2", "the file has bits = 1")
     ),
@@ -218,7 +222,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("train", "--seed"): of_training("--seed", "1"),
     ("train", "--force"): [
         Acts(f"{RESUMED} --seed 1", "--force", tensors, codes=(0, 2)),
-        Refused(TRAIN.replace("-o run", "-o clip"), "--force", "removes only what this command made"),
+        Refused(TRAIN.replace("-o run", "-o clip"), "--force", "only what this program made is removed"),
     ],
     # restore
     ("restore", "--output"): [
@@ -457,6 +461,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused(f"{ABLATE} -q", "--sensor carries.toml", "training windows cannot follow"),
     ],
     ("ablate", "--ppp"): [Acts(ABLATE, "--ppp 9", tensors)],
+    ("ablate", "--temperature"): [Refused(ABLATE, "--temperature 30", "temperature")],
     ("ablate", "--bits"): [Acts(ABLATE, "--bits 1", tensors)],
     ("ablate", "--crop"): [
         Acts(ABLATE, "--crop 16", tensors),

@@ -39,7 +39,7 @@ def test_the_parts_have_the_published_sizes():
 
 
 def test_wrong_names_and_settings_say_what_is_right():
-    with pytest.raises(ValueError, match="no network is called 'quivr'; known: quiver, quiver-s, mergenet, unet"):
+    with pytest.raises(ValueError, match="no network is called 'quivr'; known: quiver-s, quiver, mergenet, unet"):
         build("quivr")
     with pytest.raises(ValueError, match="multiple of the 16 deformable groups, got 8"):
         Config(channels=8)

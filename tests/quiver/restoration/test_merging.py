@@ -65,9 +65,9 @@ def test_little_memory_cuts_tiles_and_says_so():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         whole = method().restore(codes, 0, 1)
-    with pytest.warns(UserWarning, match=r"cut into 2 tiles.*; --memory \d+MB avoids the cut") as caught:
+    with pytest.warns(UserWarning, match=r"cut into 2 tiles.*; memory=\d+MB avoids the cut") as caught:
         cut = method(memory=1_500 * 16 * 180).restore(codes, 0, 1)
-    enough = int(re.search(r"--memory (\d+)MB", str(caught[0].message))[1]) * 10**6
+    enough = int(re.search(r"memory=(\d+)MB", str(caught[0].message))[1]) * 10**6
     assert cut_pieces(MergeNet(MergeNetConfig(4)), 16, 264, enough).exact
     assert np.sqrt(np.mean((cut - whole) ** 2)) < 0.4 * whole.std()  # codes of pure noise have arbitrary paths
 

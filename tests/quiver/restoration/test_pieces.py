@@ -151,7 +151,7 @@ def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path, monkeypa
     whole = quiet(network_restorer(path, RestoreOptions(memory=10**10)), codes)
     found = float(np.sqrt(np.mean((np.load(tmp_path / "r.npy") - whole) ** 2))) / codes.white
     assert 0 < found < 10 * said
-    needed = int(re.search(r"--memory (\d+)MB avoids the cut", text)[1]) * 10**6  # type: ignore[index]
+    needed = int(re.search(r"memory=(\d+)MB avoids the cut", text)[1]) * 10**6  # type: ignore[index]
     assert cut_pieces(network, 88, 104, needed).exact
 
 
@@ -204,7 +204,7 @@ def test_memory_does_not_change_what_a_classical_method_answers_searched(name):
 
 def test_a_method_that_takes_more_than_the_bound_says_so():
     codes = moving(3, 16, 20)
-    with pytest.warns(UserWarning, match=r"qbp takes about 0 MB for a frame of 16 x 20 px, above --memory"):
+    with pytest.warns(UserWarning, match=r"qbp takes about 0 MB for a frame of 16 x 20 px, above memory=1000"):
         found = restorer("qbp", RestoreOptions(memory=1000)).restore(codes)
     np.testing.assert_array_equal(found, restorer("qbp").restore(codes))
 

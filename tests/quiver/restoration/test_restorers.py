@@ -89,7 +89,7 @@ def test_weights_are_found_by_file_folder_and_name(tmp_path):
     with pytest.raises(ValueError, match=r"no method 'fastdvd' \(did you mean 'fastdvdnet'\?\)"):
         restorer("fastdvd")
     for name in ("unet", "emvd-1m", "rvrt"):
-        with pytest.raises(ValueError, match=rf"^{name}: a network without shipped weights; train it with .* {name}`"):
+        with pytest.raises(ValueError, match=rf"^{name}: a network without shipped weights; train it"):
             restorer(name)
     (tmp_path / "young").mkdir()
     (tmp_path / "young/settings.json").write_text("{}")

@@ -65,7 +65,7 @@ def test_an_optimum_at_the_edge_is_marked(clip):
     assert answer.marked(found, "multibit") == ">= 2"
     sentence = answer.answer(found)
     lost = found.best("multibit").psnr_db - next(row for row in found.rows if row.model == "multibit").psnr_db
-    assert f"multibit >= 2 bits, 1 bit is {lost:.1f} dB worse (the deepest tried: try --bits 1,...,4)" in sentence
+    assert f"multibit >= 2 bits, 1 bit is {lost:.1f} dB worse (the deepest tried: try bits 1,...,4)" in sentence
     deep = study(clip, StudySettings(bits=(4, 5), ppp=30.0, instants=2))
     assert answer.at_edge(deep, "multibit") == "<="
 
