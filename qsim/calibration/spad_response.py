@@ -163,9 +163,10 @@ class Response:
         mean = stack.total / t
         even = mean  # the code that an evenly lit array of this pixel's light would have
         if self.crosstalk:
-            even = np.maximum(mean - self.crosstalk * (over_neighbours(mean) - NEIGHBOURS * mean), 0.0)
+            even = mean - self.crosstalk * (over_neighbours(mean) - NEIGHBOURS * mean)
         arrivals, codes = self.table(float(even.max()))
-        found = np.interp(even, codes, arrivals)
+        # Noise makes some of them negative: cut off, they would raise the mean of dark pixels.
+        found = np.interp(even, codes, arrivals) + np.minimum(even, 0.0) * (arrivals[1] / codes[1])
         slope_table = np.gradient(codes, arrivals)
         at = np.interp(stack.mean, codes, arrivals)
         variance = np.where(stack.pixel_variance > 0, stack.pixel_variance, 0.0) if t > 1 else mean
