@@ -45,6 +45,8 @@ def names(sizes: Sizes) -> list[str]:
 
 def networks() -> list[str]:
     """Return the networks that are trained here: those of the paper and ours, not the compared ones (rivals/)."""
+    import torch  # noqa: F401  (without it nothing is trained, and no data are rendered for it)
+
     from quiver.model.names import PRESETS
 
     ours = [name for name, preset in PRESETS.items() if not preset.home.startswith("rivals.")]
