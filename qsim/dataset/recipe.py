@@ -38,6 +38,7 @@
     row_delay = 2e-6           # seconds from one row, or column, to the next; default: all at once
     row_order = "down"         # order of rows: down, the default, or up; of columns: right or left
     exposures = [1.0, 0.25]    # shares of a code's time with light, in turn; default: all of it
+    light_drift = 0.2          # rise of the light from the first code to the last, as a share; default 0
     colour = "rggb"            # colour filters: rggb, quad, rgbw or a .toml with [colour]; default: the sensor's
     temperature = 25.0         # degrees C, by a law of the sensor file (dark_doubling); default: that of the file
 
