@@ -1,9 +1,9 @@
 """Checks data sets, clips, streams and restored video; draws codes again, and repairs what is damaged.
 
-check     compares every file with its checksum: a description holds that of its keys, and those of its frames or codes
-redraw    draws stored streams again with the reference engine, from description and clip alone: a checksum shows that
-          codes are those that were written, a second draw whether they are right
-repair    removes the damaged files and records of finished jobs, so that these jobs are done again
+    check     compares every file with its checksum: a description holds that of its keys, its frames or its codes
+    redraw    draws stored streams again with the reference engine, from description and clip alone: a checksum shows
+              that codes are those that were written, a second draw whether they are right
+    repair    removes the damaged files and records of finished jobs, so that these jobs are done again
 """
 
 from __future__ import annotations
