@@ -4,6 +4,8 @@
     redraw    draws stored streams again with the reference engine, from description and clip alone: a checksum shows
               that codes are those that were written, a second draw whether they are right
     repair    removes the damaged files and records of finished jobs, so that these jobs are done again
+
+A folder that was moved and linked is read through its link; a repair replaces no links.
 """
 
 from __future__ import annotations
