@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from qsim import files
 from qsim.cli.command import Idle, command
 from qsim.cli.completion import sensors
-from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, note, output, running
+from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, in_options, note, output, running
 from qsim.cli.options import check_free
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
@@ -153,7 +153,7 @@ IDLE = (
 def convert(asked: Convert, hints: Hints) -> int:
     """Import what is foreign, export what is ours, and print what was made."""
     made = _export(asked, hints) if asked.is_ours else _import(asked, hints)
-    output({"made": [str(path) for path, _ in made]}, [f"{path}: {about}" for path, about in made])
+    output({"made": [str(path) for path, _ in made]}, [f"{path}: {in_options(about)}" for path, about in made])
     return 0
 
 

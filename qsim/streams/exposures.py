@@ -174,7 +174,7 @@ class Exposures:
             apart = max(apart, float(np.abs(codes.mean(axis=1) - codes[:, n // 2]).max()))
         if apart < UNEVEN:
             return ""
-        what = "its truth has the light of its middle clip frame; render at the code rate with shutter=1"
+        what = "its truth has the light of its middle clip frame; render at the code rate with an open shutter"
         return f"; light flickers within a code, by up to {100 * apart:.3g} % of its mean: {what}"
 
 

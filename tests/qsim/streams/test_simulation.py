@@ -77,7 +77,7 @@ def test_codes_whose_truth_has_other_light_say_so(tmp_path, bits, stated):
     stream, line = sense(clip, Sensing(BinarySPAD(0.5, 200.0, bits), ppp=0.5 * (2**bits - 1), group=True, name="s"))
     assert len(stream) == 14 // (2**bits - 1)
     words = "light flickers within a code, by up to 57.1 % of its mean: its truth has the light of its middle clip"
-    assert (f"; {words} frame; render at the code rate with shutter=1" in line) == stated
+    assert (f"; {words} frame; render at the code rate with an open shutter" in line) == stated
 
 
 @pytest.mark.parametrize(
