@@ -205,6 +205,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Acts("sense clip --sensor counter.toml --ppp 3 --name n", "--follow"),
         Refused("sense clip", "--follow", "followed"),
     ],
+    ("sense", "--light-drift"): [Refused("sense clip --replay clip:1", "--light-drift 0.2", "draws what is stored")],
     ("sense", "--temperature"): [
         Refused("sense clip", "--temperature 20", "no law of temperature"),
         Refused("sense clip --replay clip:1", "--temperature 20", "draws what is stored"),

@@ -27,6 +27,7 @@ OTHER = {  # of every setting whose outcome is not in the description: a value t
     "row_delay": 1e-6,
     "row_order": "up",
     "exposures": (1.0, 0.25),
+    "light_drift": 0.2,
     "follow": True,
     "temperature": 25.0,
     "pixel_pitch": 1.1e-6,

@@ -117,6 +117,7 @@ def test_every_other_setting_is_refused(make_clip: ClipMaker):
         "row_order": "up",
         "colour": "rggb",
         "exposures": (1.0, 0.5),
+        "light_drift": 0.2,
         "follow": True,
     }
     assert {setting.name for setting in settings_of(Sensing)} == {*others, *HONOURED}
