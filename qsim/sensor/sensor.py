@@ -170,9 +170,10 @@ class Sensor(Distribution):
         engine: str = "auto",
     ) -> Iterator[Array]:
         """Yield the codes [t, H, W] of successive blocks of photons [t, H, W], the first of frame key.frame."""
+        frame = key.frame
         for block in photons:
-            yield self.sample(block, exposure, key=key, origin=origin, engine=engine)
-            key = key.at(key.frame + len(block)) if key.frame + len(block) < 2**32 else key
+            yield self.sample(block, exposure, key=key.at(frame), origin=origin, engine=engine)
+            frame += len(block)
 
     def sample_packed(
         self, photons: Array, exposure: float, *, key: Key, origin: tuple[int, int] = (0, 0), engine: str = "auto"
