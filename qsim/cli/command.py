@@ -169,5 +169,7 @@ def _kinds(run: Callable[..., int]) -> list[_Kind]:
             found.append(_Kind(notes[0], bare=True, names=notes[1:]))
             continue
         several = get_origin(hint) is tuple
-        found.append(_Kind(get_args(hint)[0] if several else hint, several, defaults=notes[0] if notes else {}))
+        record = get_args(hint)[0] if several else hint
+        defaults = notes[0] if notes else {}
+        found.append(_Kind(record, several, defaults=defaults))
     return found

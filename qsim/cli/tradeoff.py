@@ -349,7 +349,9 @@ def _paper_figure(asked: Tradeoff) -> int:
         raise ValueError(f"--speed {asked.speed}: --paper-figure draws one speed; give one")
     rate, frames = (paper_figures.RATE_1, 201) if number == 1 else (10_000.0, 511)
     shape = study_clips.ClipShape(frames, height, width, rate, seed=asked.draws)
-    names = [asked.source] if asked.source else ["fan"] if number == 1 else ["fan", "text"]
+    names = ["fan"] if number == 1 else ["fan", "text"]
+    if asked.source:
+        names = [asked.source]
     rows = []
     result = []
     for name, ppp in zip(names * (2 // len(names) if number == 2 else 1), (0.51, 0.40), strict=False):

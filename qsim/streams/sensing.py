@@ -118,9 +118,12 @@ class Sensing:
         """The given name, or one made of the settings: `quiver-physical_3bit_3.25ppp`."""
         if self.name is not None:
             return check_name(self.name)
-        light = (
-            "asis" if self.ppp is self.lux is None else f"{self.ppp:g}ppp" if self.lux is None else f"{self.lux:g}lx"
-        ).replace("e+", "e")  # a name holds no +
+        light = "asis"
+        if self.ppp is not None:
+            light = f"{self.ppp:g}ppp"
+        if self.lux is not None:
+            light = f"{self.lux:g}lx"
+        light = light.replace("e+", "e")  # a name holds no +
         bits = "" if self.depth is None else f"_{self.depth}bit"
         seed = f"_seed{self.seed}" if self.seed else ""
         sensor = Path(self.sensor_name).name.removesuffix(".toml")

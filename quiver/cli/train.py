@@ -116,8 +116,9 @@ def settings_of_run(bundle: str, given: Mapping[str, Any]) -> Settings:
     if any(sensor.endswith(".toml") for sensor in given.get("sensor", ())):
         defaults.pop("bits", None)  # a sensor file states its own; a named sensor beside it has those of the streams
     data = given["data"]
-    named = {"data": data[0] if len(data) == 1 else data} if isinstance(data, tuple) else {}
-    return Settings(**defaults | dict(given) | named)
+    if isinstance(data, tuple) and len(data) == 1:
+        data = data[0]
+    return Settings(**defaults | dict(given) | {"data": data})
 
 
 def _of_stream(given: Mapping[str, Any], settings: Settings) -> Settings:

@@ -203,13 +203,15 @@ def _trained(text: str | None) -> tuple[Illumination, ...]:
             return tuple(Illumination.from_dict(values) for values in settings["noise"])
         sensors, bits, ppp = (_listed(settings.get(name)) for name in ("sensor", "bits", "ppp"))
         return tuple(
-            Illumination.of(str(sensor), None if light is None else float(light), None if depth is None else int(depth))
-            for sensor in sensors
-            for depth in bits
-            for light in ppp
+            Illumination.of(str(sensor), light, _whole(depth)) for sensor in sensors for depth in bits for light in ppp
         )
     except (ValueError, TypeError, AttributeError, RecursionError):
         return ()
+
+
+def _whole(value: Any) -> int | None:
+    """Return bits as a whole number, None for those of the sensor."""
+    return None if value is None else int(value)
 
 
 def _listed(value: Any) -> list[Any]:
