@@ -59,6 +59,10 @@ class Sensor(Distribution):
         """The sensor of one binary plane, where a code sums some; else this sensor."""
         return self
 
+    def of_planes(self, planes: int) -> Sensor:
+        """Return the same pixel with codes that sum so many binary planes, where codes can be such sums."""
+        raise ValueError(f"{type(self).__name__}: only a clocked SPAD sums planes")
+
     @property
     def gain(self) -> float:
         """Codes per electron or avalanche."""

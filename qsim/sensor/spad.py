@@ -7,7 +7,7 @@ of them, called arrivals.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy import ndarray as Array
@@ -48,7 +48,7 @@ class SPAD(Sensor):
         return replace(self, dark_count_rate=rate)
 
     def white(self, exposure: float) -> float:
-        """Return (2^bits - 1) / PDE.
+        """Return the largest code / PDE.
 
         This light would fill the code if every plane could count, and no pixel were ever dead.
         """
@@ -57,7 +57,7 @@ class SPAD(Sensor):
 
 @dataclass(frozen=True)
 class BinarySPAD(SPAD):
-    """A clocked pixel: one plane is 1 if anything arrived; a code is the sum of M = 2^bits - 1 planes.
+    """A clocked pixel: one plane is 1 if anything arrived; a code is the sum of M planes, by default 2^bits - 1.
 
     **Planes are drawn one by one**, up to 8 bits. Frame f of a b-bit stream is the sum of planes f M ... f M + M - 1,
     and plane p is the code that a 1-bit sensor draws for frame p of the same key. So two bit depths of one plane rate
@@ -67,21 +67,50 @@ class BinarySPAD(SPAD):
     """
 
     bits: int = 1  # 1 ... 16
+    summed: int | None = None  # planes of a code, where they are fewer than 2^bits - 1
 
     code_model: ClassVar[str] = "binary_sum"
     sums_planes: ClassVar[bool] = True
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.summed is None:
+            return
+        if not isinstance(self.summed, int) or self.summed.bit_length() != self.bits:
+            least = 1 << (self.bits - 1)
+            raise ValueError(
+                f"BinarySPAD.summed: a code of {self.bits} bits sums {least} to {2 * least - 1} planes, "
+                f"got {self.summed!r}"
+            )
+        if self.summed == (1 << self.bits) - 1:
+            object.__setattr__(self, "summed", None)  # one sensor has one form
+
     @property
     def planes(self) -> int:
-        """Return the number of binary planes in one code, M = 2^bits - 1."""
-        return self.levels - 1
+        """Return the number of binary planes in one code, M = 2^bits - 1 unless `summed` is given."""
+        return (1 << self.bits) - 1 if self.summed is None else self.summed
+
+    @property
+    def levels(self) -> int:
+        """Return the number of codes, M + 1."""
+        return self.planes + 1
 
     @property
     def plane(self) -> BinarySPAD:
-        return replace(self, bits=1)
+        return replace(self, bits=1, summed=None)
+
+    def of_planes(self, planes: int) -> BinarySPAD:
+        """Return the same pixel with codes that sum so many binary planes, 1 ... 65535."""
+        return replace(self, bits=planes.bit_length(), summed=planes)
 
     def at_depth(self, bits: int) -> BinarySPAD:
-        return replace(self, bits=bits)
+        return replace(self, bits=bits, summed=None)
+
+    def to_dict(self) -> dict[str, Any]:
+        found = super().to_dict()
+        if self.summed is None:
+            found.pop("summed")
+        return found
 
     def law(self, *, summed: bool = False, disturbed: bool = False, read_out: bool = False) -> str:
         return "planes" if summed or disturbed or self.bits <= _PLANES_BITS else "process"
@@ -151,7 +180,7 @@ class BinarySPAD(SPAD):
                 f"got {list(photons.shape)}"
             )
         require_counters(key, (len(photons) // self.planes, *photons.shape[1:]), origin, self.planes)
-        single = replace(self, bits=1)
+        single = self.plane
         codes = np.empty((len(photons) // self.planes, *photons.shape[1:]), self.dtype)
         for t in range(len(codes)):
             group = photons[t * self.planes : (t + 1) * self.planes]
@@ -195,7 +224,7 @@ class BinarySPAD(SPAD):
 
         Error: the rounding of one exponential, 1e-16 in the probability of each plane, at any number of bits.
         """
-        single = replace(self, bits=1)
+        single = self.plane
         m = self.planes
         codes = np.zeros(photons.shape, self.dtype)
         rows = max(1, _BATCH // max(photons.shape[1] * m, 1))
@@ -213,7 +242,7 @@ class BinarySPAD(SPAD):
         """As every sensor: the sum of the planes, where plane p of frame f is frame f M + p of a 1-bit sensor."""
         if self.bits == 1:
             return super().draw_at(photons, exposure, key=key, at=at)
-        single = replace(self, bits=1)
+        single = self.plane
         m = self.planes
         first = at * np.array([[m], [1], [1]])
         planes = (first + np.array([[plane], [0], [0]]) for plane in range(m))

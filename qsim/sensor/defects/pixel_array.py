@@ -163,7 +163,7 @@ class PixelArray:
         """Return codes as sums of M planes, as BinarySPAD draws them, each with afterpulses of the plane before."""
         assert isinstance(self.sensor, BinarySPAD)
         m = self.sensor.planes
-        plane = replace(self, sensor=replace(self.sensor, bits=1))
+        plane = replace(self, sensor=self.sensor.plane)
         codes = np.zeros(photons.shape, self.sensor.dtype)
         for p in range(len(photons) * m):
             at = key.at(key.frame * m + p)

@@ -59,6 +59,31 @@ def test_two_bit_depths_of_one_plane_rate_use_the_same_photons():
     assert 0 < deep.mean() < 7
 
 
+@pytest.mark.parametrize("planes", [2, 10, 100])
+def test_a_sum_of_any_number_of_planes_has_the_law_and_the_photons_of_its_planes(planes):
+    """M need not be 2^bits - 1: the same planes of the same key, in the reference and in the compiled engine."""
+    sensor = BinarySPAD(0.4, 100.0).of_planes(planes)
+    assert (sensor.levels, sensor.white(1.0)) == (planes + 1, planes / 0.4)
+    assert sensor.to_dict()["summed"] == planes
+    light = np.random.default_rng(0).uniform(0, 2 * planes, (128, 129))
+    key = Key(1, 2, frame=5)
+    flat = BinarySPAD(0.4, 100.0).sample(
+        np.broadcast_to(light / planes, (planes, *light.shape)), 1e-4, key=key.at(5 * planes), engine="reference"
+    )
+    for engine in ("reference", "fast"):
+        codes = sensor.sample(light, planes * 1e-4, key=key, engine=engine)
+        assert np.count_nonzero(codes != flat.sum(axis=0)) < 3  # the compiled engine rounds
+    expected, _ = binomial_oracle(planes, 3.0, 0.4, 100.0 * planes * 1e-4)
+    np.testing.assert_allclose(sensor.pmf(3.0, planes * 1e-4), [float(p) for p in expected], rtol=1e-9)
+
+
+def test_sums_of_all_planes_of_a_depth_are_one_sensor():
+    assert BinarySPAD(0.4, 1.0).of_planes(7) == BinarySPAD(0.4, 1.0, 3)
+    assert "summed" not in BinarySPAD(0.4, 1.0).of_planes(7).to_dict()
+    with pytest.raises(ValueError, match="a code of 3 bits sums 4 to 7 planes, got 9"):
+        BinarySPAD(0.4, 1.0, 3, 9)
+
+
 def test_planes_that_see_their_own_instant_are_summed_in_groups():
     """A light that is on in the first group only: the second code holds dark counts, of which there are none."""
     sensor = BinarySPAD(0.5, 0.0, 2)
