@@ -22,6 +22,7 @@ from .sensor.sensor import Sensor as Sensor
 from .sensor.spad import BinarySPAD as BinarySPAD
 from .sensor.spike import SpikeCamera as SpikeCamera
 from .streams.clip import Clip as Clip
+from .streams.plane_sums import PlaneSums as PlaneSums
 from .streams.sensing import Sensing as Sensing
 from .streams.storing import replay as replay
 from .streams.storing import sense as sense

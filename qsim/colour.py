@@ -86,9 +86,9 @@ def tone_picture(linear: NDArray[np.floating], peak: float, *, colours: bool) ->
     return np.moveaxis(levels, -3, -1) if colours else levels
 
 
-def code_levels(codes: NDArray[np.integer], bits: int) -> NDArray[np.uint8]:
-    """Return codes 0 ... 2^bits - 1 as grey levels 0 ... 255, linearly."""
-    return np.rint(255.0 * codes / (2**bits - 1)).astype(np.uint8)
+def code_levels(codes: NDArray[np.integer], top: int) -> NDArray[np.uint8]:
+    """Return codes 0 ... `top` as grey levels 0 ... 255, linearly."""
+    return np.rint(255.0 * codes / top).astype(np.uint8)
 
 
 def flow_colours(flow: NDArray[np.floating], largest: float) -> NDArray[np.uint8]:

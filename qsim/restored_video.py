@@ -15,6 +15,7 @@ from numpy import ndarray as Array
 
 from qsim import descriptions, files, records
 from qsim.checks import check_video
+from qsim.clip.source import Times
 from qsim.files import Progress, load_array
 from qsim.kinds import Count, Digest, NotNegative, Positive, Text, Whole
 
@@ -32,6 +33,9 @@ class VideoInfo:
     white: Positive | None = None  # photons at the brightest code of the sensor
     shape: Annotated[tuple[Whole, ...], Meta(min_length=3, max_length=4)] | None = None  # [T, H, W] or [T, 3, H, W]
     frame_rate: Positive | None = None  # Hz
+    plane_rate: Positive | None = None  # Hz, of the planes behind the codes, where codes are sums of planes
+    planes_per_code: Whole = 1
+    times: Times | None = None  # of the frames
     exposure: Positive | None = None  # s
     sensor: dict[str, Any] = field(default_factory=dict)  # as its record describes itself
     colour: dict[str, Any] = field(default_factory=dict)  # the colour filters, as their record describes itself
@@ -39,6 +43,16 @@ class VideoInfo:
     source: str = ""  # the codes: a file, or in words
     codes_sha256: Text | None = None
     quiver: str = ""  # version of the program
+
+    @property
+    def rates(self) -> str:
+        """The rate of the frames, and that of the planes that a code sums, as text; empty if it is not known."""
+        if self.frame_rate is None:
+            return ""
+        planes = (
+            "" if self.plane_rate is None else f"{self.planes_per_code} planes per code, {self.plane_rate:g} planes/s, "
+        )
+        return f"{planes}{self.frame_rate:g} codes/s"
 
     def __post_init__(self) -> None:
         records.settle(self)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -30,6 +30,7 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.plane_sums import AS_STORED, PlaneRange, PlaneSums, Read, Sums
 from qsim.streams.stream import Stream, is_stream
 
 _BLOCK_BYTES = 1 << 25
@@ -46,40 +47,76 @@ def read_stack(
     photons: float | None,
     hints: Hints = Hints(),  # noqa: B008 (frozen)
     planes: int | None = None,
+    single: bool = False,
+    frames: PlaneRange = AS_STORED,
 ) -> FrameStatistics:
     """Return the statistics of the frames in a file: `.npy` of integer values, a stream, or any recording of `convert`.
 
     `exposure` in seconds, `photons` per pixel and exposure. `hints` state where the values lie (its `bits` do not
     count); with a `width` and no `layout` an `.npy` is a photon cube of packed planes. With `planes` every value sums
-    this number of binary planes. `ValueError` or `FileNotFoundError` naming the file.
+    this number of binary planes. Single planes (a stream or a cube of one bit, or `single`) are summed when they are
+    read. `frames` chooses some of the file's. `ValueError` or `FileNotFoundError` naming the file.
     """
+    stored = _stored(path, bits, exposure, planes, single, hints)
+    together = planes if planes is not None and stored.bits == 1 and planes > 1 else 1
+    chosen = PlaneSums(frames.start, frames.stop, frames.every, together).over(stored.shape[0], str(path))
+    blocks = _blocks(stored, chosen)
     if planes is None:
-        blocks = _blocks(path, bits, exposure, None, hints)
         return measure(blocks, bits=bits, exposure=exposure, photons=photons, name=str(path))
-    blocks = _blocks(path, planes.bit_length(), exposure, planes, hints)
     return measure_sums(blocks, planes=planes, exposure=exposure, photons=photons, name=str(path))
 
 
-def _blocks(path: Path, bits: int, exposure: float, planes: int | None, hints: Hints) -> Iterator[Array]:
-    """Return the frames of a file in blocks [t, H, W]."""
+@dataclass(frozen=True)
+class _Stored:
+    """The frames of a file: their shape [T, H, W], those of a range, and the bits of a value."""
+
+    shape: tuple[int, ...]
+    read: Read
+    bits: int
+
+
+def _stored(path: Path, bits: int, exposure: float, planes: int | None, single: bool, hints: Hints) -> _Stored:
+    """Return the frames of a file, which sums of planes hold as such or as single planes."""
+    if planes is not None:
+        bits = 1 if single else planes.bit_length()
     stream = stream_of(path)
     if stream is not None:
         if hints.width not in (None, stream.shape[2]):
             raise ValueError(
                 f"{path}: is a stream of {stream.shape[2]} pixels per row, not {hints.width}; leave width= out"
             )
-        return _array_blocks(read_counts(path, replace(hints, width=None), bits, exposure * (planes or 1)))
+        bits = 1 if stream.bits == 1 and planes is not None else bits
+        return _of_array(read_counts(path, replace(hints, width=None), bits, _seconds(bits, exposure, planes)), bits)
     bare = hints == Hints(variable=hints.variable)
     if bare and path.suffix in (".npy", ".mat"):
-        return _array_blocks(read_counts(path, hints, bits, exposure * (planes or 1)))
+        return _of_array(read_counts(path, hints, bits, _seconds(bits, exposure, planes)), bits)
     if bare and path.suffix.lower() == ".npz":
-        return _array_blocks(_photon_codes(path, bits, exposure, planes))
+        parts = None if single else planes
+        return _of_array(_photon_codes(path, bits, exposure, parts), bits)
     if path.suffix == ".npy" and hints.layout is None:  # dark planes could be several layouts
         hints = replace(hints, layout="codes" if hints.width is None else "cube")
+        bits = bits if hints.width is None or planes is None else 1
     recording = importing.read(path, replace(hints, bits=min(bits, 16)), compared=("bits",))
     if recording.is_light or recording.bits != bits:
         raise ValueError(f"{path}: holds {recording.format}, not values of {bits} bits")
-    return (block for _, block in importing.blocks(recording))
+    return _Stored(recording.shape, recording.read, bits)
+
+
+def _seconds(bits: int, exposure: float, planes: int | None) -> float:
+    """Return the exposure [s] of a value of so many bits: of one plane, or of all that are summed in it."""
+    return exposure * (planes if planes is not None and bits > 1 else 1)
+
+
+def _of_array(array: Array, bits: int) -> _Stored:
+    return _Stored(array.shape, lambda start, stop: np.asarray(array[start:stop]), bits)
+
+
+def _blocks(stored: _Stored, chosen: Sums) -> Iterator[Array]:
+    """Return the chosen frames in blocks [t, H, W]."""
+    read = chosen.of(stored.read)
+    step = max(1, _BLOCK_BYTES // (8 * stored.shape[1] * stored.shape[2]))
+    for start in range(0, chosen.codes, step):
+        yield read(start, min(start + step, chosen.codes))
 
 
 def stream_of(path: Path) -> Stream | None:
@@ -144,12 +181,6 @@ def read_counts(
     if array.ndim != 3 or array.size == 0:
         raise ValueError(f"{path}: expected frames [T, H, W], found shape {list(array.shape)}")
     return array
-
-
-def _array_blocks(array: Array) -> Iterator[Array]:
-    step = max(1, _BLOCK_BYTES // (8 * array.shape[1] * array.shape[2]))
-    for start in range(0, len(array), step):
-        yield np.asarray(array[start : start + step])
 
 
 def sensor_of(found: Calibration) -> Sensor:

@@ -11,6 +11,7 @@ from qsim.cli.console import output, refuse_existing
 from qsim.formats.recording import Hints, Layout
 from qsim.kinds import Bits, Planes, Positive
 from qsim.settings import setting
+from qsim.streams.plane_sums import PlaneRange
 
 COUNTS = 8  # bits; larger codes of a SPAD may be sums of planes, which the user must state
 
@@ -46,8 +47,8 @@ class Calibrate:
     planes: Annotated[
         Planes | None,
         setting(
-            "spad: every value is the sum of this many binary planes, SECONDS and PHOTONS are those of one plane; "
-            "1: values are single exposures"
+            "spad: every value is the sum of this many binary planes, or with --bits 1 is made so; SECONDS and PHOTONS "
+            "are those of one plane; 1: values are single exposures"
         ),
     ] = None
     model: Annotated[Literal["qis", "spad"] | None, setting("kind of sensor", unset="qis; spad with --planes")] = None
@@ -74,15 +75,17 @@ def _is_packed(layout: Layout) -> bool:
 _NO_DEAD_TIME = "binary planes have no dead time in this model"
 IDLE = (
     Idle(
-        lambda asked, _: "the static scene of --static replaces dark and flat frames" if asked.static else "",
+        lambda asked, *_: "the static scene of --static replaces dark and flat frames" if asked.static else "",
         ("dark", "flat"),
     ),
     Idle(
-        lambda asked, _: "a qis has no dead time for --static to find" if asked.static and asked.model == "qis" else "",
+        lambda asked, *_: (
+            "a qis has no dead time for --static to find" if asked.static and asked.model == "qis" else ""
+        ),
         ("model",),
     ),
     Idle(
-        lambda asked, _: (
+        lambda asked, *_: (
             "a QIS is calibrated from its own codes; for sums of binary planes add --model spad"
             if asked.kind == "qis"
             else ""
@@ -90,32 +93,36 @@ IDLE = (
         ("planes",),
     ),
     Idle(
-        lambda asked, _: "binary planes have no dead time for --static to find" if asked.sums and asked.static else "",
+        lambda asked, *_: "binary planes have no dead time for --static to find" if asked.sums and asked.static else "",
         ("planes",),
     ),
     Idle(
-        lambda asked, _: (
+        lambda asked, *_: (
             "" if asked.kind == "spad" and not asked.static else "it is for --model spad with dark and flat frames"
         ),
         ("ignore_dead_time",),
     ),
-    Idle(lambda asked, _: "" if asked.kind == "spad" else "it is for --model spad and --static", ("paralyzable",)),
-    Idle(lambda asked, _: "--ignore-dead-time takes no dead time" if asked.ignore_dead_time else "", ("paralyzable",)),
+    Idle(lambda asked, *_: "" if asked.kind == "spad" else "it is for --model spad and --static", ("paralyzable",)),
+    Idle(lambda asked, *_: "--ignore-dead-time takes no dead time" if asked.ignore_dead_time else "", ("paralyzable",)),
     Idle(
-        lambda asked, _: f"--planes {asked.planes} are 1-bit planes" if asked.sums and asked.bits != 1 else "",
+        lambda asked, *_: f"--planes {asked.planes} are 1-bit planes" if asked.sums and asked.bits != 1 else "",
         ("bits",),
     ),
-    Idle(lambda asked, _: _NO_DEAD_TIME if asked.sums or asked.bits == 1 else "", ("ignore_dead_time", "paralyzable")),
     Idle(
-        lambda asked, layout: (
-            "it is for packed binary planes, which are read one by one"
-            if _is_packed(layout) and (asked.sums or asked.static)
+        lambda asked, *_: "the counts of --static are used as a whole" if asked.static else "",
+        ("start", "stop", "every"),
+    ),
+    Idle(lambda asked, *_: _NO_DEAD_TIME if asked.sums or asked.bits == 1 else "", ("ignore_dead_time", "paralyzable")),
+    Idle(
+        lambda asked, layout, _: (
+            "it is for packed binary planes, and counts are read one by one"
+            if _is_packed(layout) and asked.static
             else ""
         ),
         ("width",),
     ),
     Idle(
-        lambda asked, layout: (
+        lambda asked, layout, _: (
             f"it is for packed binary planes, and --bits is {asked.bits}"
             if _is_packed(layout) and (asked.bits or 1) > 1
             else ""
@@ -131,7 +138,7 @@ IDLE = (
     "qsim calibrate --bits 8 --static counts.npy 6.33e-6 -o counter.toml",
     idle=IDLE,
 )
-def calibrate(asked: Calibrate, layout: Layout) -> int:
+def calibrate(asked: Calibrate, layout: Layout, frames: PlaneRange) -> int:
     """Measure the sensor, write its files and print its numbers."""
     from qsim.calibration import sensor_file
     from qsim.calibration.qis import calibrate_qis
@@ -141,8 +148,8 @@ def calibrate(asked: Calibrate, layout: Layout) -> int:
         raise ValueError(f"{asked.output}: the sensor file is a .toml, as in -o my_sensor.toml")
     model, bits = _calibration_kind(asked)
     _check_outputs(asked, model)
-    darks = [_stack(words, asked, layout, bits, dark=True) for words in asked.dark]
-    flats = [_stack(words, asked, layout, bits, dark=False) for words in asked.flat]
+    darks = [_stack(words, asked, layout, frames, dark=True) for words in asked.dark]
+    flats = [_stack(words, asked, layout, frames, dark=False) for words in asked.flat]
     if asked.static:
         found = _static(asked, layout, bits)
     elif model == "qis":
@@ -200,7 +207,8 @@ def _calibration_kind(asked: Calibrate) -> tuple[str, int]:
 def _assumed(asked: Calibrate, model: str, bits: int) -> str:
     """Return a line that states how the numbers in the files are interpreted."""
     if asked.planes is not None and asked.planes > 1:
-        return f"sums of {asked.planes} binary planes of a SPAD; seconds and photons are those of one plane"
+        made = ", made of single planes" if asked.bits == 1 else ""
+        return f"sums of {asked.planes} binary planes of a SPAD{made}; seconds and photons are those of one plane"
     if asked.static:
         return f"counts of one exposure each, {bits} bits, of a static scene (for sums of planes: --planes)"
     if model == "spad" and bits > 1:
@@ -230,7 +238,7 @@ def _number(word: str) -> float:
         raise ValueError(f"{word!r} is not a number; give seconds, as in 1e-3") from None
 
 
-def _stack(words: tuple[str, ...], asked: Calibrate, layout: Layout, bits: int, *, dark: bool) -> Any:
+def _stack(words: tuple[str, ...], asked: Calibrate, layout: Layout, frames: PlaneRange, *, dark: bool) -> Any:
     from qsim.calibration.sensor_file import read_stack
 
     kind, most = ("--dark", 2) if dark else ("--flat", 3)
@@ -242,9 +250,11 @@ def _stack(words: tuple[str, ...], asked: Calibrate, layout: Layout, bits: int, 
     photons = 0.0 if dark else numbers[1] if len(numbers) > 1 else None
     return read_stack(
         Path(words[0]),
-        bits=bits,
+        bits=asked.bits or 1,
         exposure=numbers[0],
         photons=photons,
         hints=_hints_of(layout),
         planes=asked.planes if asked.planes != 1 else None,
+        single=asked.sums and asked.bits == 1,
+        frames=frames,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,16 +16,19 @@ from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
 from qsim.formats.recording import Hints, Recording
+from qsim.formats.summing import sum_planes
 from qsim.kinds import Positive, Split, Text, Whole
 from qsim.restored_video import describes_restored
 from qsim.settings import setting, settings_of
 from qsim.streams.clip import Clip
+from qsim.streams.plane_sums import PlaneSums
 from qsim.streams.stream import Stream, is_stream
 
 PICTURES = ("mp4", "png", "nerfstudio")  # kinds that show light through a transfer curve
 _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs", ".dat": "spike", ".npz": "photons"}
 
 OTHERS = "writing for others"
+KINDS = sorted([*exporting.EXPORTS, "pairs"])
 
 
 @dataclass(frozen=True)
@@ -60,10 +64,10 @@ class Convert:
         str | None,
         setting(
             "kind of the output; pairs: codes, truth and flow in one .h5; challenge: cubes of colour planes with their "
-            "truth; nerfstudio: pictures and their poses, transforms.json",
+            "truth; nerfstudio: pictures and their poses, transforms.json (planes end before --until)",
             unset="from the suffix of its name",
             section=OTHERS,
-            choices=sorted([*exporting.EXPORTS, "pairs"]),
+            choices=KINDS,
         ),
     ] = None
     window: Annotated[
@@ -103,6 +107,15 @@ class Convert:
         return self.source.suffix != ".json"
 
 
+@dataclass(frozen=True)
+class ConvertedSums(PlaneSums):
+    """Which planes of a recording `qsim convert` writes; its option --to names a kind of output."""
+
+    stop: Annotated[
+        Whole | None, setting("number of the plane (or code) before which to end", unset="all", option="until")
+    ] = None
+
+
 def _is_stream(path: Path) -> bool:
     return path.suffix == ".json" and path.is_file() and is_stream(path)
 
@@ -120,18 +133,18 @@ def _written(asked: Convert, acts: bool) -> str:
 _STATED = tuple(one.name for one in settings_of(Hints) if one.name not in ("transfer", "white"))
 IDLE = (
     Idle(
-        lambda asked, _: f"{asked.input} is ours and states it" if asked.is_ours else "",
+        lambda asked, *_: f"{asked.input} is ours and states it" if asked.is_ours else "",
         ("frame_rate", "exposure", "sensor", "ppp", "split", *_STATED),
     ),
     Idle(
-        lambda asked, _: (
+        lambda asked, *_: (
             f"{asked.input} is read, not written for others" if asked.input.exists() and not asked.is_ours else ""
         ),
         ("to", "lossy", "window"),
     ),
-    Idle(lambda asked, _: _written(asked, asked.is_light and asked.kind in PICTURES), ("transfer", "white")),
-    Idle(lambda asked, _: _written(asked, asked.kind == "mp4"), ("lossy",)),
-    Idle(lambda asked, _: _written(asked, asked.kind in ("pairs", "challenge")), ("window",)),
+    Idle(lambda asked, *_: _written(asked, asked.is_light and asked.kind in PICTURES), ("transfer", "white")),
+    Idle(lambda asked, *_: _written(asked, asked.kind == "mp4"), ("lossy",)),
+    Idle(lambda asked, *_: _written(asked, asked.kind in ("pairs", "challenge")), ("window",)),
 )
 
 
@@ -143,6 +156,7 @@ IDLE = (
     "qsim convert camera.tif out/camera --frame-rate 1000 --transfer linear --white 4095",
     "qsim convert I2-2000FPS/test out/i2_test --frame-rate 2000 --transfer 'gamma 2.2' --split test",
     "qsim convert capture.bin out/capture --layout swissspad2-half --frame-rate 96800",
+    "qsim convert out/capture.npy out/capture_7 --planes 7 --from 1000 --until 8000",
     "qsim convert out/starter out/starter_mp4 --to mp4",
     "qsim convert out/starter out/starter.h5 --to pairs",
     "qsim convert out/challenge out/cubes --to challenge",
@@ -150,19 +164,40 @@ IDLE = (
     "qsim convert out/fan/streams/spad.json out/fan_cube.npy",
     idle=IDLE,
 )
-def convert(asked: Convert, hints: Hints) -> int:
+def convert(asked: Convert, hints: Hints, sums: ConvertedSums) -> int:
     """Import what is foreign, export what is ours, and print what was made."""
-    made = _export(asked, hints) if asked.is_ours else _import(asked, hints)
+    if asked.is_ours and sums.any:
+        made = _export_sums(asked, hints, sums)
+    else:
+        made = _export(asked, hints) if asked.is_ours else _import(asked, hints, sums)
     output({"made": [str(path) for path, _ in made]}, [f"{path}: {in_options(about)}" for path, about in made])
     return 0
+
+
+def _export_sums(asked: Convert, hints: Hints, sums: PlaneSums) -> list[tuple[Path, str]]:
+    """Write sums of a stream's planes as a stream, or with a kind of output for others."""
+    source = asked.source
+    if asked.is_light:
+        raise ValueError(
+            f"{source}: planes are summed and chosen in a stream; name one of its streams, as in "
+            f"{source / 'streams'}/NAME.npy"
+        )
+    stream = Stream.open(source)
+    if asked.kind in (None, "cube") and asked.to is None:
+        with bar("summing") as progress:
+            made = sum_planes(stream, sums, asked.output, force=asked.force, progress=progress)
+        return [(made.path, f"{_size(made)}, {made.bits}-bit codes, {made.rates}")]
+    with tempfile.TemporaryDirectory() as folder:
+        between = sum_planes(stream, sums, Path(folder) / f"{stream.name}.npy")
+        path, about = _export(replace(asked, input=between.path), hints)[0]
+        return [(path, f"{about}, {between.rates}")]
 
 
 def _export(asked: Convert, hints: Hints) -> list[tuple[Path, str]]:
     kind = asked.kind
     source = asked.source
     if kind is None:
-        known = ", ".join(sorted([*exporting.EXPORTS, "pairs"]))
-        raise ValueError(f"{asked.output}: name the kind of output with --to: {known}")
+        raise ValueError(f"{asked.output}: name the kind of output with --to: {', '.join(KINDS)}")
     planes = asked.window or challenge.PLANES
     wanted = exporting.Export(kind, hints.transfer or "gamma 2.2", hints.white, not asked.lossy, planes=planes)
     if kind == "pairs":
@@ -202,7 +237,7 @@ def _pairs(asked: Convert) -> tuple[Path, str]:
     return asked.output, about
 
 
-def _import(asked: Convert, hints: Hints) -> list[tuple[Path, str]]:
+def _import(asked: Convert, hints: Hints, sums: PlaneSums) -> list[tuple[Path, str]]:
     restored = _restored(asked.input)
     frame_rate = asked.frame_rate or restored.get("frame_rate")
     exposure = asked.exposure or restored.get("exposure")
@@ -225,6 +260,8 @@ def _import(asked: Convert, hints: Hints) -> list[tuple[Path, str]]:
                 raise ValueError(f"{asked.input}: files do not state the capture rate; add --frame-rate, as in 2000")
             capture = importing.Import(rate, exposure, asked.sensor, asked.ppp, asked.split)
             if recording.is_light:
+                if sums.any:
+                    raise ValueError(f"{source}: is light, and planes are summed and chosen in recordings of codes")
                 if target.suffix in _SUFFIXES:
                     raise ValueError(
                         f"{target}: light is read into a clip, a folder; name it without {target.suffix}, or write a "
@@ -237,8 +274,9 @@ def _import(asked: Convert, hints: Hints) -> list[tuple[Path, str]]:
                 )
                 _tell_reading(source, recording)
                 continue
-            stream = importing.to_stream(recording, target, capture, force=asked.force, progress=progress)
-            made.append((stream.path, f"{_size(stream)}, {stream.bits}-bit codes, {recording.format}"))
+            stream = importing.to_stream(recording, target, capture, sums=sums, force=asked.force, progress=progress)
+            rates = "" if stream.sums is None else f", {stream.rates}"
+            made.append((stream.path, f"{_size(stream)}, {stream.bits}-bit codes, {recording.format}{rates}"))
             _tell_reading(source, recording)
     return made
 

@@ -18,6 +18,7 @@ from qsim.cli.console import bar, output, refuse_existing, running
 from qsim.clip.manifest import check_outside
 from qsim.kinds import Bits, Count, Frames, Text
 from qsim.settings import setting
+from qsim.streams.plane_sums import PlaneSums
 from qsim.terminal import is_lost, printable
 
 PREVIEWS = (".mp4", ".gif", ".png")
@@ -57,18 +58,21 @@ class Preview:
 
 IDLE = (
     Idle(
-        lambda asked: "" if asked.output is None else "shows frames in the terminal, and --output writes all of them",
+        lambda asked, _: (
+            "" if asked.output is None else "shows frames in the terminal, and --output writes all of them"
+        ),
         ("play",),
     ),
     Idle(
-        lambda asked: "" if asked.output else "acts on a file, and the terminal shows this preview", ("force", "scale")
+        lambda asked, _: "" if asked.output else "acts on a file, and the terminal shows this preview",
+        ("force", "scale"),
     ),
     Idle(
-        lambda asked: "" if asked.film else "one picture has no rate; write a film (.mp4, .gif), use --play",
+        lambda asked, _: "" if asked.film else "one picture has no rate; write a film (.mp4, .gif), use --play",
         ("fps",),
     ),
     Idle(
-        lambda asked: "shows one frame, and --play and --fps a film of all" if asked.play or asked.fps else "",
+        lambda asked, _: "shows one frame, and --play and --fps a film of all" if asked.play or asked.fps else "",
         ("frame",),
     ),
 )
@@ -79,9 +83,10 @@ IDLE = (
     "qsim preview out/fan --what flow --frame 3",
     "qsim preview out/fan -o out/fan.mp4 --fps 25",
     "qsim preview out/fan.npy -o out/fan.png --frame 10",
+    "qsim preview cube.npy --width 320 --planes 7 --from 1000 -o cube.mp4",
     idle=IDLE,
 )
-def preview(asked: Preview) -> int:
+def preview(asked: Preview, sums: PlaneSums) -> int:
     """Show pictures in the terminal, or write them as a film or picture."""
     from qsim.report import preview as pictures
     from qsim.report.views import choose, declaration, open_source
@@ -99,7 +104,7 @@ def preview(asked: Preview) -> int:
         refuse_existing(target, asked.force)
         refuse_existing(pictures.sidecar(target), asked.force)
     rate = asked.fps or SHOWN_RATE
-    source = open_source(asked.path, bits=asked.bits, width=asked.width, stream=asked.stream)
+    source = open_source(asked.path, bits=asked.bits, width=asked.width, stream=asked.stream, sums=sums)
     if asked.frame is not None and not 0 <= asked.frame < source.length:
         raise ValueError(f"--frame {asked.frame}: {source.name} has frames 0..{source.length - 1}")
     views = choose(source, list(asked.what) if asked.what else None, several=target is not None)
@@ -111,12 +116,18 @@ def preview(asked: Preview) -> int:
     if target is None:
         return _show(asked, source, views, frames)
     shown = f"{frames.start}..{frames.stop - 1}" if film else str(first)
-    about = {"source": str(asked.path), "frames": [frames.start, frames.stop], "frame_rate": source.frame_rate}
+    about = {
+        "source": str(asked.path),
+        "frames": [frames.start, frames.stop],
+        "frame_rate": source.frame_rate,
+        "rates": source.rates,
+    }
     target.parent.mkdir(parents=True, exist_ok=True)
     with bar(target.name) as progress:
         page = pictures.sheet(views, asked.scale)
         pictures.write(target, page, frames, rate, about | {"shown_fps": rate}, progress)
-    lines = [f"{target}: frame {shown} of {source.name}" + (f" at {rate:g} fps" if film else "")]
+    rates = f", {source.rates}" if source.rates else ""
+    lines = [f"{target}: frame {shown} of {source.name}" + (f" at {rate:g} fps" if film else "") + rates]
     found = about | {"preview": str(target), "views": [declaration(view) for view in views]}
     output(found, lines + [view.declared for view in views])
     return 0
@@ -134,6 +145,7 @@ def _show(asked: Preview, source: Any, views: list[Any], frames: range) -> int:
     coloured = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
     window = shutil.get_terminal_size()
     draw = pictures.half_blocks if coloured else pictures.shades
+    rates = f", {source.rates}" if source.rates else ""
     for view in views:
         for t in frames:
             text = draw(pictures.fit_terminal(view.picture(t), window.columns, max(window.lines - 4, 8)))
@@ -146,7 +158,7 @@ def _show(asked: Preview, source: Any, views: list[Any], frames: range) -> int:
         if view.legend is not None:
             print(draw(pictures.fit_terminal(view.legend, 24, 12)))
         stretched = "" if coloured else ", contrast stretched"
-        print(printable(f"frame {frames[-1]} of {source.name}, {view.declared}{stretched}"))
+        print(printable(f"frame {frames[-1]} of {source.name}{rates}, {view.declared}{stretched}"))
     return 0
 
 

@@ -249,7 +249,7 @@ def _grey(source: Clip | Stream, wanted: Export, meta: dict[str, Any]) -> Iterat
             yield from levels if source.bands is None else np.ascontiguousarray(np.moveaxis(levels, -3, -1))
     else:
         for block in _code_blocks(source):
-            yield from code_levels(block, source.bits)
+            yield from code_levels(block, 2**source.bits - 1)
 
 
 def _depth(clip: Clip, wanted: Export) -> int:

@@ -22,7 +22,7 @@ from qsim.checks import file_path
 from qsim.clip import exr
 from qsim.clip.clip_info import ClipInfo, Saturation
 from qsim.clip.manifest import check_outside
-from qsim.clip.source import Source
+from qsim.clip.source import Source, Times
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
 from qsim.formats import gaps
@@ -36,6 +36,7 @@ from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 from qsim.streams.clip import Clip
+from qsim.streams.plane_sums import AS_STORED, PlaneSums, Sums
 from qsim.streams.stream import Stream, is_stream, write_packed
 from qsim.streams.stream_info import StreamInfo
 
@@ -190,22 +191,35 @@ def saturation_line(clip: Clip) -> str:
 
 
 def to_stream(
-    recording: Recording, path: Path, capture: Import, *, force: bool = False, progress: Progress | None = None
+    recording: Recording,
+    path: Path,
+    capture: Import,
+    *,
+    sums: PlaneSums = AS_STORED,
+    force: bool = False,
+    progress: Progress | None = None,
 ) -> Stream:
     """Write codes as a stream without a clip: PATH.npy and PATH.json. The default sensor is an ideal counter.
 
-    Tables [defects] and [colour] of a sensor's file are stored: they belong to the frames as they are written.
+    Planes of one bit are summed as asked; the rate and the exposure of `capture` are those of a plane. Tables [defects]
+    and [colour] of a sensor's file are stored: they belong to the frames as they are written.
     """
     if recording.bits is None:
         raise ValueError(
             f"{path}: {recording.format} holds light, not codes; name a clip folder to make, as in out/clip"
         )
     _check_stream(path, recording, capture)
-    npy = _free_stream(path, force)
-    frames, height, width = recording.shape
+    npy = free_stream(path, force)
+    length, height, width = recording.shape
     capture = _as_stated(path, recording, capture)
-    sensor, tables = _tables(capture, _sensor(recording, capture), height, width)
+    taken = sums.over(length, recording.format, bits=recording.bits)
+    sensor, tables = _tables(capture, _sensor(recording, capture, taken.planes), height, width)
     model = recording.code_model if sensor.sums_planes else sensor.code_model
+    times = recording.times if taken.codes == length else _times(recording, capture, taken)
+    planes = taken.planes if taken.planes > 1 else (sensor.levels - 1 if model == "binary_sum" else 1)
+    frames = taken.codes
+    if sums.any:
+        recording = replace(recording, shape=(frames, height, width), read=taken.of(recording.read))
     npy.parent.mkdir(parents=True, exist_ok=True)
 
     def packed() -> Iterator[Array]:
@@ -220,14 +234,20 @@ def to_stream(
         shape=(frames, height, width),
         orientation=recording.source.orientation or "unknown",  # upright only if a reader states it
         code_model=model,
-        planes_per_code=2**recording.bits - 1 if model == "binary_sum" else 1,
-        frame_rate=capture.frame_rate,
-        exposure=capture.seconds,
+        planes_per_code=planes,
+        frame_rate=capture.frame_rate / taken.step,
+        plane_rate=None if taken.step == taken.planes else capture.frame_rate,
+        exposure=capture.seconds * taken.planes,
         source=recording.source,
-        times=recording.times,
+        times=times,
         **tables,
     )
     return write_packed(npy, packed(), info)
+
+
+def _times(recording: Recording, capture: Import, taken: Sums) -> Times | None:
+    """Return the times of codes that some of a recording's planes make, if the recording states any."""
+    return None if recording.times is None else taken.times(capture.frame_rate, recording.times)
 
 
 def _check_stream(path: Path, recording: Recording, capture: Import) -> None:
@@ -239,14 +259,9 @@ def _check_stream(path: Path, recording: Recording, capture: Import) -> None:
     device = devices.DEVICES.get(str(capture.sensor))
     if capture.ppp is not None and not (device is not None and device.follows_light):
         raise ValueError(f"{path}: ppp= changes nothing for {capture.sensor}, whose gain is fixed; leave it out")
-    if recording.source.bitplanes is not None:
-        raise ValueError(
-            f"{path}: sums of {recording.source.bitplanes} bitplanes; codes of a stream are sums of 2^b - 1, as 3, "
-            "7 or 15"
-        )
 
 
-def _free_stream(path: Path, force: bool) -> Path:
+def free_stream(path: Path, force: bool) -> Path:
     """Return the file of a stream's codes; `FileExistsError` if it or its description exists and is not replaced."""
     check_outside(path)
     stem = path.with_suffix("") if path.suffix in (".npy", ".json") else path
@@ -288,12 +303,19 @@ def _ranges(recording: Recording) -> Iterator[tuple[int, int]]:
         yield start, min(start + step, frames)
 
 
-def _sensor(recording: Recording, capture: Import) -> Sensor:
+def _sensor(recording: Recording, capture: Import, planes: int) -> Sensor:
+    """Return the sensor of the codes of a recording of which so many are summed, by default an ideal one."""
+    stored = recording.source.bitplanes
+    if capture.sensor is not None and (planes > 1 or stored is not None):
+        many = stored or planes
+        return devices.load_sum(capture.sensor, many, ppp=capture.ppp, exposure=capture.seconds / (stored or 1))
     if capture.sensor is not None:
         return devices.load(capture.sensor, ppp=capture.ppp, bits=recording.bits, exposure=capture.seconds)
     if recording.code_model == CountingSPAD.code_model:
         return CountingSPAD(pde=1.0, dark_count_rate=0.0, dead_time=0.0, bits=recording.bits or 1)
-    return BinarySPAD(pde=1.0, dark_count_rate=0.0, bits=recording.bits or 1)
+    ideal = BinarySPAD(pde=1.0, dark_count_rate=0.0, bits=recording.bits or 1)
+    many = stored or planes
+    return ideal.of_planes(many) if many > 1 else ideal
 
 
 def _tables(capture: Import, sensor: Sensor, height: int, width: int) -> tuple[Sensor, dict[str, Any]]:

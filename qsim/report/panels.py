@@ -118,7 +118,7 @@ def stream_panels(stream: Stream, frames: range, truth: Photons | None = None) -
     filters = stream.colour_filter
     one, many = (_inverse(stream, sensor, samples) for samples in (1, min(colour.AVERAGE, len(stream))))
     if one is None or many is None:
-        shown_codes = colour.code_levels(shown, stream.bits)
+        shown_codes = colour.code_levels(shown, stream.sensor.levels - 1)
         return [
             page.Panel(names[0], fit(shown_codes, filters)),
             page.Panel(names[1], fit(colour.tone(averages, colour.peak(averages)), filters)),

@@ -27,6 +27,7 @@ from qsim.restored_video import Restored, RestoredInfo, describes_restored
 from qsim.sensor import packing
 from qsim.sensor.demosaicing import demosaic, determines_bands
 from qsim.streams.clip import Clip
+from qsim.streams.plane_sums import AS_STORED, PlaneSums
 from qsim.streams.stream import Stream
 
 Picture = NDArray[np.uint8]  # [H, W, 3]
@@ -54,30 +55,43 @@ class Source:
     length: int  # frames
     frame_rate: float | None  # per second of the scene, if known
     views: dict[str, View]
+    rates: str = ""  # of codes and of the planes that they sum, in words
 
 
-def open_source(path: Path, *, bits: int | None = None, width: int | None = None, stream: str | None = None) -> Source:
+def open_source(
+    path: Path,
+    *,
+    bits: int | None = None,
+    width: int | None = None,
+    stream: str | None = None,
+    sums: PlaneSums = AS_STORED,
+) -> Source:
     """Open a clip folder, a stream (.npy or .json) or an array [T, H, W] or [H, W] in a .npy.
 
     For an array of whole numbers, `bits` means codes and `width` packed binary planes of that many columns. `stream`
-    selects one of a clip's streams (default: the first). Raise `FileNotFoundError` or `ValueError` for other paths.
+    selects one of a clip's streams (default: the first). Of a stream or an array of codes, `sums` are shown.
+    Raise `FileNotFoundError` or `ValueError` for other paths.
     """
     if (path / "dataset.json").is_file():
         raise ValueError(f"{path}: is a data set; name one of its clips, as in {path / 'clips'}/NAME")
     if path.is_dir() or not path.exists():
         clip = Clip.open(path)
         _refuse(path, "a clip, whose streams state their bits", bits=bits, width=width)
+        if sums.any:
+            raise ValueError(f"{path}: is a clip; planes are summed in a stream, as in {path / 'streams'}/NAME.npy")
         return _clip_source(clip, stream)
     _refuse(path, "not a clip", stream=stream)
     sidecar = path.with_suffix(".json")
     described = files.read_json(sidecar) if sidecar.is_file() else {}
     if "code_model" in described:
         _refuse(path, "a stream, which states its bits", bits=bits, width=width)
-        return _stream_source(Stream.open(sidecar))
+        return _stream_source(Stream.open(sidecar), sums)
     if path.suffix != ".npy":
         raise ValueError(f"{path}: expected a clip folder, a stream or a .npy array; `qsim convert` reads other files")
     video = Restored.open(sidecar).info if describes_restored(described) else None
-    return _array_source(path, bits, width, video)
+    if video is not None and sums.any:
+        raise ValueError(f"{path}: is restored video, and planes are summed in a recording of codes")
+    return _array_source(path, bits, width, video, sums)
 
 
 def _refuse(path: Path, what: str, **options: int | str | None) -> None:
@@ -128,20 +142,26 @@ def _held(view: View, per: int, late: float) -> View:
     )
 
 
-def _stream_source(stream: Stream) -> Source:
-    def read(start: int, stop: int) -> NDArray[Any]:
-        return stream.codes(start, stop)
-
+def _stream_source(stream: Stream, sums: PlaneSums = AS_STORED) -> Source:
     filters = stream.colour_filter
     own = stream.sensor.efficiency
     bands = None
     if filters is not None and determines_bands(filters, own):  # else one filter over all pixels, shown in grey
         bands = partial(demosaic, filters=filters, efficiency=own)
-    views = _code_views(stream.name, stream.bits, len(stream), read, bands)
-    return Source(stream.name, len(stream), stream.info.frame_rate, views)
+    rate = stream.info.frame_rate
+    if not sums.any:
+        top = stream.sensor.levels - 1
+        views = _code_views(stream.name, top, len(stream), stream.codes, bands)
+        return Source(stream.name, len(stream), rate, views, stream.rates)
+    taken = sums.over(len(stream), str(stream.path), bits=stream.bits)
+    top = taken.planes if taken.planes > 1 else stream.sensor.levels - 1
+    views = _code_views(stream.name, top, taken.codes, taken.of(stream.codes), bands)
+    return Source(stream.name, taken.codes, rate / taken.step, views, taken.words(rate))
 
 
-def _array_source(path: Path, bits: int | None, width: int | None, video: RestoredInfo | None) -> Source:
+def _array_source(
+    path: Path, bits: int | None, width: int | None, video: RestoredInfo | None, sums: PlaneSums
+) -> Source:
     array = load_array(path)
     array = array[None] if array.ndim == 2 else array
     in_colour = video is not None and bool(video.colour)
@@ -152,13 +172,15 @@ def _array_source(path: Path, bits: int | None, width: int | None, video: Restor
         title = "values" if video is None else f"restored by {video.method}"
         unit = "as stored" if video is None else video.unit
         view = _light_view("values", title, unit, length, lambda t: np.asarray(array[t], np.float64))
-        return Source(path.stem, length, rate, {"values": view})
+        return Source(path.stem, length, rate, {"values": view}, "" if video is None else video.rates)
     if array.dtype.kind == "b":
         _refuse(path, "an array of truth values", bits=bits, width=width)
         bits = 1
     elif width is not None:
         _refuse(path, "packed planes of 1 bit (width=)", bits=bits)
-        return _packed_source(path, array, width)
+        return _packed_source(path, array, width, sums)
+    if bits is None and (sums.planes or 1) > 1:
+        bits = 1
     if bits is None:
         raise ValueError(f"{path}: whole numbers are codes or packed planes; add bits=3, or width=320 for planes")
     if not 1 <= bits <= 16:
@@ -167,10 +189,20 @@ def _array_source(path: Path, bits: int | None, width: int | None, video: Restor
     def read(start: int, stop: int) -> NDArray[Any]:
         return checked_codes(path, np.asarray(array[start:stop]), bits, start)
 
-    return Source(path.stem, length, rate, _code_views(path.stem, bits, length, read))
+    return _bare_source(path, bits, length, read, sums)
 
 
-def _packed_source(path: Path, array: NDArray[Any], width: int) -> Source:
+def _bare_source(
+    path: Path, bits: int, length: int, read: Callable[[int, int], NDArray[Any]], sums: PlaneSums
+) -> Source:
+    """Return the views of codes of these bits in a bare array, or of sums of them."""
+    taken = sums.over(length, str(path), bits=bits)
+    top = taken.planes if taken.planes > 1 else 2**bits - 1
+    views = _code_views(path.stem, top, taken.codes, taken.of(read))
+    return Source(path.stem, taken.codes, None, views, taken.words(None) if sums.any else "")
+
+
+def _packed_source(path: Path, array: NDArray[Any], width: int, sums: PlaneSums) -> Source:
     if array.dtype != np.uint8 or width < 1 or packing.packed_width(width, 1) != array.shape[2]:
         raise ValueError(
             f"{path}: {array.dtype} {list(array.shape)} does not hold packed planes of {width} columns; "
@@ -180,7 +212,7 @@ def _packed_source(path: Path, array: NDArray[Any], width: int) -> Source:
     def read(start: int, stop: int) -> NDArray[Any]:
         return packing.unpack(np.asarray(array[start:stop]), 1, width)
 
-    return Source(path.stem, len(array), None, _code_views(path.stem, 1, len(array), read))
+    return _bare_source(path, 1, len(array), read, sums)
 
 
 def _samples(length: int) -> list[int]:
@@ -206,13 +238,15 @@ def _toned(light: NDArray[Any], brightest: float) -> Picture:
 
 def _code_views(
     name: str,
-    bits: int,
+    top: int,
     length: int,
     read: Callable[[int, int], NDArray[Any]],
     bands: Callable[[NDArray[Any]], NDArray[Any]] | None = None,
 ) -> dict[str, View]:
-    """Return the views of codes; `bands` makes the mean of a mosaic [H, W] a picture of three bands [3, H, W]."""
-    top = 2**bits - 1
+    """Return the views of codes 0 ... `top`.
+
+    `bands` makes the mean of a mosaic [H, W] a picture of three bands [3, H, W].
+    """
     reach = colour.AVERAGE // 2
 
     def average(t: int) -> NDArray[np.float64]:
@@ -220,14 +254,14 @@ def _code_views(
         return mean if bands is None else bands(mean)
 
     def code(t: int) -> Picture:
-        return _grey(colour.code_levels(read(t, t + 1)[0], bits))
+        return _grey(colour.code_levels(read(t, t + 1)[0], top))
 
     brightest = colour.peak(np.stack([average(t) for t in _samples(length)]))
     shown = f"codes of {name}: 0 black, {top} white, no curve"
     after = "" if bands is None else ", demosaiced"
     mean = f"naive mean of {colour.AVERAGE} frames{after}: brightest shown = {brightest * top:.4g} codes, curve {CURVE}"
     return {
-        "codes": View("codes", shown, code, None, {"bits": bits}),
+        "codes": View("codes", shown, code, None, {"bits": top.bit_length()}),
         "average": View("average", mean, lambda t: _toned(average(t), brightest), None, {"brightest_shown": brightest}),
     }
 

@@ -29,7 +29,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from qsim import files
-from qsim.checks import file_path, suggest
+from qsim.checks import ArgumentError, file_path, suggest
 from qsim.records import convert
 from qsim.sensor import file_laws
 from qsim.sensor.counting import CountingSPAD
@@ -270,8 +270,55 @@ def load(
         raise ValueError(f"unknown sensor {str(name)!r}{suggest(str(name), DEVICES)}; `qsim sensors` lists all")
     sensor = from_toml(path, bits, conditions)
     if bits is not None and bits != sensor.bits:
-        raise ValueError(f"{path}: the file has bits = {sensor.bits}, the request {bits}; change one of them")
+        cure = "change one of them"
+        if sensor.at_depth(bits) is not None:
+            cure = f"{cure}, or delete the line of bits: such a file serves every depth"
+        raise ValueError(f"{path}: the file has bits = {sensor.bits}, the request {bits}; {cure}")
     return sensor
+
+
+def load_sum(
+    name: str | Path | Sensor,
+    planes: int,
+    *,
+    bits: int | None = None,
+    ppp: float | None = None,
+    exposure: float = 5e-4,
+) -> Sensor:
+    """Return the sensor of codes that sum so many planes, each of `exposure` [s]; else as `load`.
+
+    `bits` may be those of a plane or of the sum, and so may those of a file. `ValueError` for others, and for a sensor
+    that sums no planes.
+    """
+    loaded = load(name, ppp=ppp, bits=plane_bits(name, planes, bits), exposure=exposure)
+    if planes == 1:
+        return loaded.plane if loaded.sums_planes else loaded
+    if not loaded.sums_planes:
+        kind = type(loaded).__name__
+        shown = kind if isinstance(name, Sensor) else name
+        raise ArgumentError(
+            "planes",
+            f"{shown}: only a clocked SPAD sums planes, this is a {kind}; give another sensor, as in spad-320x240",
+        )
+    return loaded.plane.of_planes(planes)
+
+
+def plane_bits(name: str | Path | Sensor, planes: int, bits: int | None = None) -> int:
+    """Return the bits with which a sensor is loaded whose planes are summed; `ArgumentError` for other depths.
+
+    They are those that are given or that the sensor states: of a plane, or of a sum. Files of no bits serve both.
+    """
+    own = name.bits if isinstance(name, Sensor) else table_of(name).get("bits")
+    stated = bits if bits is not None else own
+    if not isinstance(stated, int):
+        return 1
+    if stated not in (1, planes.bit_length()):
+        where = "" if bits is not None else f" in {name}"
+        depths = "planes are 1-bit codes"
+        if planes > 1:
+            depths = f"a plane has 1 bit and a sum of {planes} has {planes.bit_length()}"
+        raise ArgumentError("bits", f"{stated}{where}: {depths}; leave it out")
+    return own if isinstance(own, int) else stated
 
 
 def from_toml(path: str | Path, bits: int | None = None, conditions: Conditions = NOTHING) -> Sensor:

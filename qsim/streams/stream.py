@@ -31,6 +31,7 @@ from qsim.sensor.defects import defect_table, good_pixels
 from qsim.sensor.defects.defect_table import Defects
 from qsim.streams.exposures import Timing
 from qsim.streams.photons import clip_photons
+from qsim.streams.plane_sums import Sums
 from qsim.streams.rows import Rows
 from qsim.streams.stream_info import StreamInfo
 
@@ -162,6 +163,22 @@ class Stream:
         """When codes collect light: clip frames, rows and schedule."""
         frames = self.info.planes_per_code
         return self.info.sensing.timing(frames, frames > 1 and self.sensor.sums_planes)
+
+    @property
+    def sums(self) -> Sums | None:
+        """The planes behind the codes, if they are sums of planes; else None."""
+        planes = self.info.planes_per_code
+        if planes == 1 or not self.sensor.sums_planes:
+            return None
+        rate = self.info.plane_rate or self.info.frame_rate * planes
+        return Sums(planes, 0, round(rate / self.info.frame_rate), len(self))
+
+    @property
+    def rates(self) -> str:
+        """The rate of the codes, and where they are sums that of their planes, as text."""
+        return (
+            self.sums.words(self.info.frame_rate * self.sums.step) if self.sums else f"{self.info.frame_rate:g} codes/s"
+        )
 
     @property
     def rows(self) -> Rows | None:

@@ -45,6 +45,7 @@ class StreamInfo:
     exposure: Positive  # s of light in one code: in all its planes if it sums some, in a full one under a schedule
     frame_rate: Positive  # codes per second
     planes_per_code: Whole = 1  # clip frames in a code: planes that are summed, or slices of an exposure
+    plane_rate: Positive | None = None  # planes per second, where codes leave some out; else one code follows the other
     sensor: dict[str, Any]  # model and parameters
     sensor_name: str = ""  # name or file; of a record, nothing
     defects: dict[str, Any] = field(default_factory=dict)  # table [defects]; measured maps with their checksums

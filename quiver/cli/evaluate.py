@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from qsim.checks import ArgumentError
 from qsim.cli.command import Idle, command
 from qsim.cli.console import RESUMES, WITHOUT_FORCE, bar, note, output, refuse_existing, running
 from qsim.cli.options import check_free
@@ -15,6 +16,7 @@ from qsim.files import write_bytes, write_json
 from qsim.kinds import Light, Text
 from qsim.locks import Lock
 from qsim.settings import setting
+from qsim.streams.plane_sums import PlaneSums
 from qsim.words import frame_size
 from quiver.cli.options import Threads, check_domain, given, renew, use_threads
 from quiver.device import DEVICES
@@ -42,7 +44,10 @@ IDLE = (
         lambda asked, *_: _COUNTS if asked.static else "",
         ("output", "split", "stream", "sensor", "ppp", "protocol", "published", "force"),
     ),
-    Idle(lambda asked, *_: "" if asked.static else "belongs to --static COUNTS", ("frames", "splits")),
+    Idle(
+        lambda asked, *_: "" if asked.static else "belongs to --static COUNTS",
+        ("frames", "splits", "width", "planes", "start", "stop", "every"),
+    ),
     Idle(
         lambda asked, *_: f"--protocol {asked.protocol} decides it" if asked.protocol else "",
         tuple(next(iter(PROTOCOLS.values()))),
@@ -73,10 +78,11 @@ IDLE = (
     "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,mergenet --split all",
     "quiver evaluate I2-2000FPS/test -o out/published --protocol quiver-published --methods moment,out/mine",
     "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,mergenet",
+    "quiver evaluate --static still.npy --width 512 --planes 7 --methods moment,mergenet",
     after_interrupt=RESUMES,
     idle=IDLE,
 )
-def evaluate(asked: EvaluateSettings, options: RestoreOptions, limit: Threads) -> int:
+def evaluate(asked: EvaluateSettings, sums: PlaneSums, options: RestoreOptions, limit: Threads) -> int:
     """Score the methods, and write tables and pictures; return 1 if a method failed."""
     from quiver import threads
     from quiver.restoration.restorers import restorers
@@ -89,7 +95,7 @@ def evaluate(asked: EvaluateSettings, options: RestoreOptions, limit: Threads) -
     refuse_idle(given(options), methods)
     use_threads(limit.threads)
     if asked.static is not None:
-        return _run_static(asked, methods)
+        return _run_static(asked, sums, methods)
     if asked.source is None or asked.output is None:
         raise ValueError("give a data set or clip folder and -o, or --static COUNTS")
     from quiver.evaluation import comparison as scoring
@@ -197,9 +203,9 @@ def _published_test(asked: EvaluateSettings) -> Comparison:
     )
 
 
-def _run_static(asked: EvaluateSettings, methods: Sequence[Any]) -> int:
+def _run_static(asked: EvaluateSettings, sums: PlaneSums, methods: Sequence[Any]) -> int:
     from quiver.data.clips import peak_of
-    from quiver.data.photon_counts import read_counts
+    from quiver.data.photon_counts import read_counts, read_planes
     from quiver.evaluation.json_values import json_safe
     from quiver.evaluation.static_object import FORMAT, counted, evaluate_static, markdown
 
@@ -210,14 +216,19 @@ def _run_static(asked: EvaluateSettings, methods: Sequence[Any]) -> int:
         raise ValueError("--bits: measured counts are clipped to one depth; give one number")
     if not asked.static.is_file():
         raise FileNotFoundError(f"{asked.static}: no such file")
-    counts = read_counts(asked.static)
-    bits = (asked.bits or (3,))[0]
+    planes = sums.any or asked.width is not None
+    counts = read_planes(asked.static, sums, asked.width) if planes else read_counts(asked.static)
+    if planes and asked.bits is not None:
+        raise ArgumentError("bits", f"sums of {sums.planes or 1} planes are not clipped; leave it out")
+    bits = (asked.bits or (3,))[0] if counts.sums is None else counts.sums.bits
     frames = asked.frames or 11
     check_domain(asked, methods, [counted(counts, bits)])
     scores = evaluate_static(
         counts, methods, frames=frames, bits=bits, splits=asked.splits or 3, seed=asked.seed or 0, peak=asked.peak
     )
     found = {"format": FORMAT, "counts": str(asked.static), "frames": frames, "bits": bits}
+    if counts.sums is not None:
+        found |= {"planes_per_code": counts.sums.planes, "plane_rate": counts.plane_rate}
     found["peak"] = peak_of(counts.light, asked.peak)
     found["scores"] = [asdict(score) for score in scores]
     output(json_safe(found), markdown(counts, scores, frames, bits, asked.peak))

@@ -8,6 +8,7 @@ from pathlib import Path
 from qsim import records
 from qsim.cli.command import command
 from qsim.cli.console import RESUMES, bar, note, output
+from qsim.streams.plane_sums import PlaneSums
 from quiver.cli.options import ResumedThreads, check_domain, given, use_threads
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.settings import RestoreSettings
@@ -17,11 +18,11 @@ from quiver.restoration.settings import RestoreSettings
     "quiver restore out/starter/clips/fan_0003 -o out/fan.npy",
     "quiver restore out/fan/streams/quiver-physical_3bit_3.25ppp.npy -o out/fan.npy --method out/mine",
     "quiver restore out/fan --ppp 3.25 -o out/fan.npy --method moment",
-    "quiver restore cube.npy --width 320 --planes 7 --sensor spad-320x240 --frame-rate 1428 -o out/cube.npy",
+    "quiver restore cube.npy --width 320 --planes 7 --sensor spad-320x240 --frame-rate 10000 -o out/cube.npy",
     "quiver restore out/cubes/test -o out/submission.zip --planes 7",
     after_interrupt=RESUMES,
 )
-def restore(asked: RestoreSettings, options: RestoreOptions, limit: ResumedThreads) -> int:
+def restore(asked: RestoreSettings, sums: PlaneSums, options: RestoreOptions, limit: ResumedThreads) -> int:
     """Restore the codes, and print the cost of a frame."""
     from quiver import threads
     from quiver.data.clips import check_outside
@@ -31,11 +32,11 @@ def restore(asked: RestoreSettings, options: RestoreOptions, limit: ResumedThrea
 
     target: Path = asked.output
     if target.suffix == ".zip":
-        return _restore_cubes(asked, options, limit)
+        return _restore_cubes(asked, sums, options, limit)
     if target.suffix != ".npy":
         raise ValueError(f"{target}: restored video is written as .npy; name a .npy file")
     check_outside(target)
-    codes = codes_to_restore(asked)
+    codes = codes_to_restore(asked, sums)
     for path in (target, target.with_suffix(".json")):
         if path.exists() and not asked.force and not unnamed(target):  # restore_to_file finishes its naming
             raise FileExistsError(f"{path}: exists; name another, or replace it with --force")
@@ -63,13 +64,13 @@ def restore(asked: RestoreSettings, options: RestoreOptions, limit: ResumedThrea
     size = f"{height} x {width}" + ("" if codes.colour is None else " in R, G, B")
     output(
         {"restored": str(target)} | records.plain(info, complete=True),
-        f"{target}: {length} frames of {size} by {method.name}, "
+        f"{target}: {length} frames of {size} by {method.name}, {codes.rates}, "
         f"{info.seconds_per_frame:.3g} s per frame; photons, white of the sensor = {codes.white:.4g}",
     )
     return 0
 
 
-def _restore_cubes(asked: RestoreSettings, options: RestoreOptions, limit: ResumedThreads) -> int:
+def _restore_cubes(asked: RestoreSettings, sums: PlaneSums, options: RestoreOptions, limit: ResumedThreads) -> int:
     """Restore cubes of the Single Photon Challenge into the zip of a submission."""
     from quiver.data.challenge import COLOURS, band_codes, cubes
     from quiver.restoration.automatic import chosen_for_all
@@ -79,9 +80,10 @@ def _restore_cubes(asked: RestoreSettings, options: RestoreOptions, limit: Resum
     target: Path = asked.output
     idle = ("stream", "sensor", "ppp", "bits", "seed", "width", "frame_rate", "defects")
     refuse(asked, idle, f"{target} is a submission, whose layout states it")
+    refuse(sums, ("start", "stop", "every"), "the challenge scores the last plane of all that a cube has")
     check_target(target, asked.force)
     found = cubes(asked.source)
-    planes = asked.planes or 1
+    planes = sums.planes or 1
     bands = [band_codes(cube, colour, planes) for cube in found for colour in range(len(COLOURS))]
     method, why = chosen_for_all(asked.method, bands, options)
     refuse_idle(given(options) | {"method": asked.method}, [method])

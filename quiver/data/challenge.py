@@ -12,10 +12,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.arrays import plain
+from qsim.checks import ArgumentError
 from qsim.formats.challenge import COLOURS, DETECTIONS, Cube, cubes, picture
 from qsim.sensor.spad import BinarySPAD
-from quiver.data.codes import Codes
-from quiver.data.photon_cubes import plane_bits, sum_planes
+from qsim.streams.plane_sums import PlaneSums
+from quiver.data.codes import Codes, summed
 
 __all__ = ["COLOURS", "Cube", "band_codes", "cubes", "light_of_band", "picture"]
 
@@ -23,30 +25,28 @@ RATE = 2000.0  # planes per second: the benchmark states none, and nothing depen
 
 
 def band_codes(cube: Cube, colour: int, planes: int) -> Codes:
-    """Return one colour (0, 1, 2) of a cube as codes that sum `planes` = 2^b - 1 planes each, of an ideal clocked SPAD.
+    """Return one colour (0, 1, 2) of a cube as codes that sum `planes` planes each, of an ideal clocked SPAD.
 
-    `ValueError` for another number of planes, or more than the cube has.
+    `ArgumentError` for more planes than the cube has.
     """
-    bits = plane_bits(planes)
     frames, height, width = cube.shape
     if frames < planes:
-        raise ValueError(f"{cube.path}: {frames} planes are fewer than the {planes} of one code; give fewer planes")
-    skipped = frames % planes
+        raise ArgumentError("planes", f"{cube.path}: has {frames}, fewer than the {planes} of one code; give fewer")
     packed = cube.packed[..., colour]
 
     def read(start: int, stop: int) -> Array:
-        ends = (skipped + t * planes for t in range(start, stop))
-        return np.stack([sum_planes(packed, width, first, first + planes, bits) for first in ends])
+        return np.unpackbits(plain(packed[start:stop]), axis=2, count=width)
 
-    return Codes(
+    single = Codes(
         name=f"{cube.name} {COLOURS[colour]}",
-        shape=(frames // planes, height, width),
-        sensor=BinarySPAD(pde=1.0, dark_count_rate=0.0, bits=bits),
-        exposure=planes / RATE,
-        frame_rate=RATE / planes,
+        shape=(frames, height, width),
+        sensor=BinarySPAD(pde=1.0, dark_count_rate=0.0),
+        exposure=1 / RATE,
+        frame_rate=RATE,
         read=read,
         source=f"{cube.path}, {COLOURS[colour]}",
     )
+    return summed(single, PlaneSums(start=frames % planes, planes=planes))
 
 
 def light_of_band(photons: Sequence[Array], planes: int) -> Array:

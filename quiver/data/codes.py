@@ -20,7 +20,9 @@ from numpy import ndarray as Array
 
 from qsim import records
 from qsim.arrays import plain
+from qsim.checks import ArgumentError
 from qsim.clip.lazy_array import LazyArray
+from qsim.clip.source import Times
 from qsim.files import read_json, sha256, to_json, wording
 from qsim.keys import Key, hash_name
 from qsim.restored_video import describes_restored
@@ -29,6 +31,7 @@ from qsim.sensor.demosaicing import demosaic, determines_bands
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
 from qsim.streams.photons import clip_photons
+from qsim.streams.plane_sums import PlaneSums, Sums
 from qsim.streams.preparation import followed
 from qsim.streams.storing import describe
 from qsim.streams.stream import Stream
@@ -51,6 +54,7 @@ __all__ = [
     "sensed",
     "stored",
     "stream_codes",
+    "summed",
     "windows_sensed",
 ]
 
@@ -82,6 +86,16 @@ class Codes:
     colour: ColourFilter | None = None  # over the pixels, from the first one on; None: all see one band
     source_sha256: str | None = None  # of a stored stream's codes as its description states it
     not_inverted: str = ""  # defects that add detections, which the sensor's response leaves out: crosstalk, afterpulse
+    sums: Sums | None = None  # of a recording's planes; None: its frames are taken as they are
+    times: Times | None = None  # of the codes; None: not known
+    unfilled: Codes | None = field(default=None, compare=False, repr=False)  # the same without filled pixels
+
+    @property
+    def rates(self) -> str:
+        """Return the rate of the codes, and where they are sums that of their planes, as text."""
+        if self.sums is None:
+            return f"{self.frame_rate:g} codes/s"
+        return self.sums.words(self.frame_rate * self.sums.step)
 
     @property
     def white(self) -> float:
@@ -138,7 +152,52 @@ def filled(codes: Codes, bad: Array | None) -> Codes:
         before = codes.digest()
         return before and hashlib.sha256(before.encode() + np.packbits(marked).tobytes()).hexdigest()
 
-    return replace(codes, read=read, digest=digest, defective=marked)
+    return replace(codes, read=read, digest=digest, defective=marked, unfilled=codes.unfilled or codes)
+
+
+def summed(codes: Codes, asked: PlaneSums) -> Codes:
+    """Return the codes that sums of a recording's planes make (plane_sums.py); the same if nothing is asked.
+
+    Defective pixels are filled in the sums. `ArgumentError` for frames that do not exist, and for planes that this
+    sensor does not sum.
+    """
+    if not asked.any:
+        return codes
+    if codes.unfilled is not None:
+        return filled(summed(codes.unfilled, asked), codes.defective)
+    length, height, width = codes.shape
+    sums = asked.over(length, codes.name, bits=codes.sensor.bits)
+    sensor = codes.sensor
+    if sums.planes > 1:
+        if not sensor.sums_planes:
+            kind = type(sensor).__name__
+            raise ArgumentError(
+                "planes",
+                f"{codes.sensor_name or kind}: only a clocked SPAD sums planes, this is a {kind}; give another sensor, "
+                "as in spad-320x240",
+            )
+        sensor = sensor.of_planes(sums.planes)
+    if codes.shares is not None or (codes.sums is not None and codes.sums.planes > 1):
+        what = "exposures that take turns" if codes.shares is not None else "sums of planes already"
+        raise ArgumentError("planes", f"{codes.name} has {what}; leave it out")
+    plane_rate = codes.frame_rate
+
+    def digest() -> str:
+        before = codes.digest()
+        return before and hashlib.sha256(before.encode() + repr(sums).encode()).hexdigest()
+
+    return replace(
+        codes,
+        shape=(sums.codes, height, width),
+        sensor=sensor,
+        exposure=codes.exposure * sums.planes,
+        frame_rate=plane_rate / sums.step,
+        read=sums.of(codes.read),
+        digest=digest,
+        ppp=None if codes.ppp is None else codes.ppp * sums.planes,
+        sums=sums,
+        times=sums.times(plane_rate, codes.times),
+    )
 
 
 def frame_reader(codes: Codes) -> Callable[[int], Array]:
@@ -278,6 +337,8 @@ def stream_codes(stream: Stream) -> Codes:
         colour=stream.colour_filter,
         source_sha256=info.sha256,
         not_inverted=_not_inverted(info.defects),
+        sums=stream.sums,
+        times=info.times,
     )
     return filled(codes, bad)
 

@@ -1,4 +1,4 @@
-"""Reads photon counts of a static object from a .npy or .npz, which may be damaged."""
+"""Reads photon counts of a static object from a .npy or .npz, which may be damaged, or sums binary planes of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
+from qsim.checks import ArgumentError
 from qsim.files import decoding_errors, load_array, read_npy
+from qsim.sensor.spad import BinarySPAD
+from qsim.streams.plane_sums import PlaneSums, Sums
+from qsim.streams.sensing import Sensing
+from quiver.data.codes import open_stream, stream_codes, summed
+from quiver.data.illumination import Illumination
+from quiver.data.photon_cubes import cube_codes
 
 LARGEST = 1 << 32  # bytes of an array of counts in a .npz
 
@@ -22,11 +29,52 @@ class Counts:
     frames: Array  # integers [N, H, W]
     shares: Array  # [N]; light of each frame relative to the mean frame
     name: str
+    sums: Sums | None = None  # of binary planes, which saturate: a frame counts the planes that fired
+    plane_rate: float | None = None  # 1/s
 
     @property
     def light(self) -> float:
         """Return the mean photons per pixel and frame."""
-        return float(self.frames.mean())
+        if self.sums is None:
+            return float(self.frames.mean())
+        return float(arrivals(self.frames.mean(axis=0), self.sums.planes, len(self.frames)).mean())
+
+
+def arrivals(mean: Array, planes: int, frames: int) -> Array:
+    """Return the photons of each pixel [H, W] whose sums of so many planes have this mean over `frames` of them.
+
+    A pixel that fired in every plane has those of half a plane less: its light has no upper bound.
+    """
+    fired = np.minimum(mean / planes, 1 - 0.5 / (planes * frames))
+    return np.asarray(-planes * np.log1p(-fired))
+
+
+def read_planes(path: Path, sums: PlaneSums, width: int | None) -> Counts:
+    """Return sums of the binary planes of a static object, of an ideal clocked SPAD: of a stream, or of a .npy.
+
+    A .npy holds planes of 0 and 1, [T, H, W], or with `width` packed ones, [T, H, ceil(W/8)]. The share of a frame is
+    its light over that of the mean frame, to first order. `ValueError` for values of several bits.
+    """
+    if path.with_suffix(".json").is_file() and path.suffix in (".npy", ".json"):
+        if width is not None:
+            raise ArgumentError("width", f"{path} is a stored stream, which has its own (see its .json); leave it out")
+        codes = summed(stream_codes(open_stream(path)), sums)
+        rate = codes.frame_rate * (sums.every or sums.planes or 1)
+    else:
+        codes = cube_codes(path, Illumination(Sensing(BinarySPAD(1.0, 0.0))), 1.0, sums=sums, width=width)
+        rate = None
+    if not codes.sensor.sums_planes:
+        raise ValueError(f"{path}: holds codes of a {type(codes.sensor).__name__}, and planes are those of a SPAD")
+    frames = codes.read(0, codes.shape[0])
+    planes = codes.sensor.levels - 1
+    light = arrivals(frames.mean(axis=0), planes, len(frames))
+    slope = float((light * np.exp(-light / planes)).mean())
+    if not slope > 0:
+        raise ValueError(f"{path}: no plane holds a photon")
+    shares = 1 + (frames.mean(axis=(1, 2)) - frames.mean()) / slope
+    if not shares.min() > 0:
+        raise ValueError(f"{path}: code {int(np.argmin(shares))} holds no photon")
+    return Counts(frames, shares, path.name, codes.sums or Sums(1, 0, 1, len(frames)), rate)
 
 
 def read_counts(path: Path) -> Counts:

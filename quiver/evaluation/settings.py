@@ -64,7 +64,16 @@ class EvaluateSettings:
         Positive | None,
         setting("photons per pixel that the scores refer to", unset="2.5 x the mean light"),
     ] = None
-    static: Annotated[Path | None, setting("photon counts [N,H,W] or [T,K,H,W], .npy or .npz", shown="COUNTS")] = None
+    static: Annotated[
+        Path | None,
+        setting(
+            "photon counts [N,H,W] or [T,K,H,W], .npy or .npz; with --planes binary planes, of a stream or .npy",
+            shown="COUNTS",
+        ),
+    ] = None
+    width: Annotated[
+        Whole | None, setting("static: the .npy holds packed binary planes of this many pixels per row")
+    ] = None
     frames: Annotated[Whole | None, setting("static: frames to restore from", unset="11")] = None
     splits: Annotated[Whole | None, setting("static: random splits", unset="3")] = None
     strict: Annotated[bool, setting("networks: refuse a stream outside their measured domain")] = False

@@ -17,11 +17,12 @@ from math import isnan, nan
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.sensor.spad import BinarySPAD
 from qsim.tables import markdown_table
 from quiver.data.clips import peak_of
 from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import ideal_counter
-from quiver.data.photon_counts import Counts
+from quiver.data.photon_counts import Counts, arrivals
 from quiver.evaluation import metrics
 from quiver.restoration.interface import Restorer
 
@@ -43,14 +44,26 @@ class StaticScore:
 
 
 def reference(counts: Counts, chosen: Array) -> tuple[Array, Array]:
-    """Return the mean photons per frame [H, W] of the chosen frames, and the variance of that estimate [H, W]."""
+    """Return the mean photons per frame [H, W] of the chosen frames, and the variance of that estimate [H, W].
+
+    Of sums of planes it is the inverse of their saturation, -M log(1 - p), with the variance M p / (n (1 - p)) of n
+    sums by the delta method.
+    """
     light = float(counts.shares[chosen].sum())
+    if counts.sums is not None:
+        planes = counts.sums.planes
+        estimate = arrivals(counts.frames[chosen].mean(axis=0), planes, len(chosen))
+        return estimate * len(chosen) / light, planes * np.expm1(estimate / planes) * len(chosen) / light**2
     estimate = counts.frames[chosen].sum(axis=0, dtype=np.int64) / light
     return estimate, estimate / light
 
 
 def counted(counts: Counts, bits: int, given: Array | slice = slice(None)) -> Codes:
-    """Return the chosen frames as codes of an ideal counter with this many bits."""
+    """Return the chosen frames as codes of an ideal counter with this many bits, or of sums of planes of a SPAD."""
+    if counts.sums is not None:
+        clocked = BinarySPAD(1.0, 0.0).of_planes(counts.sums.planes)
+        sums = array_codes(counts.frames[given], clocked, 1.0, counts.name)
+        return replace(sums, ppp=counts.light, sensor_name="ideal clocked SPAD")
     _check_bits(counts, bits)
     sensor = ideal_counter(bits)
     codes = np.minimum(counts.frames[given], sensor.levels - 1).astype(np.uint8)
@@ -58,7 +71,7 @@ def counted(counts: Counts, bits: int, given: Array | slice = slice(None)) -> Co
 
 
 def _check_bits(counts: Counts, bits: int) -> None:
-    if not 1 <= bits <= 8:
+    if counts.sums is None and not 1 <= bits <= 8:
         raise ValueError(f"{counts.name}: counts are clipped to codes of 1 to 8 bits, got {bits}")
 
 
@@ -144,8 +157,9 @@ def _score(method: Restorer, counts: Counts, chosen: Sequence[Array], bits: int,
 def markdown(counts: Counts, scores: Sequence[StaticScore], frames: int, bits: int, peak: float | None = None) -> str:
     """Return the result as a Markdown table."""
     above = max((s.above_peak for s in scores if s.failure is None), default=nan)
+    depth = f"{bits} bit" if counts.sums is None else counts.sums.words(counts.plane_rate)
     text = [
-        f"# Real photons: {counts.name}, restored from {frames} of {len(counts.frames)} frames at {bits} bit",
+        f"# Real photons: {counts.name}, restored from {frames} of {len(counts.frames)} frames at {depth}",
         "",
         f"PSNR in dB, peak = {peak_of(counts.light, peak):.4g} photons per pixel"
         + ("" if peak is not None else " (2.5 x mean light)")

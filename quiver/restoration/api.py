@@ -9,8 +9,20 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.streams.plane_sums import PlaneSums
 from quiver.data.clips import Clip
-from quiver.data.codes import Codes, LazyArray, Sensor, Stream, array_codes, filled, open_stream, sensed, stream_codes
+from quiver.data.codes import (
+    Codes,
+    LazyArray,
+    Sensor,
+    Stream,
+    array_codes,
+    filled,
+    open_stream,
+    sensed,
+    stream_codes,
+    summed,
+)
 from quiver.data.defects import check_map
 from quiver.data.illumination import Illumination, is_known
 from quiver.restoration.automatic import chosen
@@ -32,6 +44,7 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     mode: str | None = None,
     strict: bool = False,
     defects: Array | None = None,
+    planes: int | PlaneSums | None = None,
 ) -> Array:
     """Return restored video, float32 [T, H, W], in photons per pixel and exposure (expected, before quantum
     efficiency). Of a stream behind colour filters it is [T, 3, H, W]: the photons of R, G and B.
@@ -44,7 +57,9 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     better, and `likelihood` for codes of different exposures. `defects` [H, W] is true at hot and dead pixels, which
     are filled from their neighbours, as are those that a stream's description states; crosstalk and afterpulses, which
     are not inverted, warn. A network outside of what it was measured for warns; with `strict` it is a `ValueError`.
-    `ValueError` or `FileNotFoundError` where the arguments do not fit together.
+    `planes` sums so many successive frames of one bit to a code; with `exposure` that of one plane, the photons are
+    those of the sum. `qsim.PlaneSums` states which planes, too. `ValueError` or `FileNotFoundError` where the arguments
+    do not fit together.
 
         video = quiver.restore(stream)
     """
@@ -52,7 +67,8 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     if not isinstance(method, str):
         raise ValueError(f"method= is a name, a weights file or a run folder as text, got {method!r}")
     bad = None if defects is None else check_map(np.asarray(defects), "defects=")
-    codes = filled(_codes(source, sensor, exposure, ppp), bad)
+    sums = planes if isinstance(planes, PlaneSums) else PlaneSums(planes=planes)
+    codes = filled(summed(_codes(source, sensor, exposure, ppp), sums), bad)
     runner, _ = chosen(method, codes, RestoreOptions(device=device or "auto", mode=mode or "exact"))
     refuse_idle({"device": device, "mode": mode, "method": method}, [runner])
     found = remarks([runner], codes)

@@ -40,6 +40,7 @@ WHAT_CHANGED = {  # key of the description -> its name in the message that a res
     "identity": "the method's settings or weights",
     "sensor": "the sensor",
     "shape": "the shape",
+    "times": "the planes",
     "source": "the source",
     "quiver": "the program's version",
 }
@@ -127,6 +128,9 @@ def _described(codes: Codes, method: Restorer) -> VideoInfo:
         white=codes.white,
         shape=codes.video_shape,
         frame_rate=codes.frame_rate,
+        plane_rate=None if codes.sums is None else codes.frame_rate * codes.sums.step,
+        planes_per_code=1 if codes.sums is None else codes.sums.planes,
+        times=codes.times,
         exposure=codes.exposure,
         sensor=codes.sensor.to_dict(),
         source=codes.source,

@@ -57,10 +57,9 @@ class RestoreSettings:
     bits: Annotated[Bits | None, setting("bits per code", unset="3; of a .toml file its own")] = None
     seed: Annotated[Seed | None, setting("seed of the noise, if a clip is sensed now", unset="0")] = None
     width: Annotated[Whole | None, setting("bare array: packed binary planes of this many pixels per row")] = None
-    planes: Annotated[Whole | None, setting("packed planes and cubes: 2^b - 1 are summed to one code", unset="1")] = (
-        None
-    )
-    frame_rate: Annotated[Positive | None, setting("bare array: codes per second", unset="2000")] = None
+    frame_rate: Annotated[
+        Positive | None, setting("bare array: frames of the file per second, planes if they are summed", unset="2000")
+    ] = None
     defects: Annotated[
         Path | None, setting("map of defective pixels, .npy [H, W], true where hot or dead: they are filled")
     ] = None

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qsim.checks import ArgumentError
+from qsim.sensor.defects import defect_table
+from qsim.streams.plane_sums import AS_STORED, PlaneSums
 from quiver.data.clips import Clip, open_clips
-from quiver.data.codes import Codes, codes_of, filled, light_of, open_stream, repaired, sensed, stream_codes
+from quiver.data.codes import Codes, codes_of, filled, light_of, open_stream, repaired, sensed, stream_codes, summed
 from quiver.data.defects import read_map
-from quiver.data.illumination import Illumination, colour_filter, follows_light, read_sensor
+from quiver.data.illumination import Illumination, colour_filter, follows_light
 from quiver.data.photon_cubes import cube_codes
 from quiver.restoration.interface import AUTO
 from quiver.restoration.mosaics import check_bands
@@ -23,9 +25,9 @@ from quiver.restoration.settings import RestoreSettings
 if TYPE_CHECKING:
     from quiver.restoration.interface import Restorer
 
-BARE = ("width", "planes", "frame_rate")  # missing in a bare array only
+BARE = ("width", "frame_rate")  # missing in a bare array only
 LIGHT = ("sensor", "ppp", "bits", "seed")
-FRAME_RATE = 2000.0  # codes per second of a bare array
+FRAME_RATE = 2000.0  # frames per second of a bare array
 
 
 def refuse(asked: Any, names: Sequence[str], why: str) -> None:
@@ -56,20 +58,21 @@ def refuse_idle(asked: Mapping[str, Any], methods: Sequence[Restorer]) -> None:
             )
 
 
-def codes_to_restore(asked: RestoreSettings) -> Codes:
+def codes_to_restore(asked: RestoreSettings, sums: PlaneSums = AS_STORED) -> Codes:
     """Return the codes of `quiver restore`: a stored stream, a clip that is sensed now, or a bare array.
 
-    Pixels that the map `defects` or the sensor's file marks are filled (quiver/data/defects.py).
+    Planes are summed as asked. Pixels that the map `defects` or the sensor's file marks are filled
+    (quiver/data/defects.py).
     """
-    codes = _found(asked)
+    codes = _found(asked, sums)
     check_bands(codes)
     return codes if asked.defects is None else filled(codes, read_map(asked.defects))
 
 
-def _found(asked: RestoreSettings) -> Codes:
+def _found(asked: RestoreSettings, sums: PlaneSums) -> Codes:
     path: Path = asked.source
     if path.is_dir():
-        return _of_clip(path, asked)
+        return summed(_of_clip(path, asked), sums)
     if path.with_name(f"{path.name}.part").is_dir() and not path.exists():
         open_clips(path)  # raises: the clip is unfinished
     if not path.is_file():
@@ -80,8 +83,8 @@ def _found(asked: RestoreSettings) -> Codes:
     if path.with_suffix(".json").is_file():
         stream = open_stream(path)
         refuse(asked, (*LIGHT, *BARE), f"{path} is a stored stream, which has its own (see its .json)")
-        return codes_of(stream)
-    return _of_array(path, asked)
+        return summed(codes_of(stream), sums)
+    return _of_array(path, asked, sums)
 
 
 def _of_clip(path: Path, asked: RestoreSettings) -> Codes:
@@ -102,18 +105,19 @@ def _of_clip(path: Path, asked: RestoreSettings) -> Codes:
     return sensed(clip, Illumination.of(_sensor(asked), asked.ppp, _bits(asked)), asked.seed or 0)[0]
 
 
-def _of_array(path: Path, asked: RestoreSettings) -> Codes:
+def _of_array(path: Path, asked: RestoreSettings, sums: PlaneSums) -> Codes:
     sensor = _sensor(asked)
     refuse(asked, ["seed"], f"is for noise that is drawn, and {path} holds codes already")
     if not follows_light(sensor):
         refuse(asked, ["ppp"], f"{path} holds codes already, and the gain of {sensor} does not follow the light")
-    light = Illumination.of(sensor, asked.ppp, asked.bits if asked.width is not None else _bits(asked))
+    planes = asked.width is not None or (sums.planes or 1) > 1
+    light = Illumination.of(sensor, asked.ppp, asked.bits if planes else _bits(asked))
     if asked.output.resolve() == path.resolve():
         raise ValueError(f"{path}: would be replaced by what is made from it; name another")
-    codes = cube_codes(path, light, asked.frame_rate or FRAME_RATE, planes=asked.planes, width=asked.width)
+    codes = cube_codes(path, light, asked.frame_rate or FRAME_RATE, sums=sums, width=asked.width)
     if not sensor.endswith(".toml"):
         return codes
-    return repaired(replace(codes, colour=colour_filter.from_toml(sensor)), read_sensor(sensor)[1])
+    return repaired(replace(codes, colour=colour_filter.from_toml(sensor)), defect_table.from_toml(sensor))
 
 
 def _sensor(asked: RestoreSettings) -> str:
@@ -139,7 +143,7 @@ def assumed(codes: Codes, method: Restorer) -> str:
     light += f", {codes.not_inverted} not inverted (restored light is too bright)" if codes.not_inverted else ""
     seen = f"{method.frames_used} frames" if method.seamless else f"all earlier and {method.look_ahead} later frames"
     return (
-        f"{codes.name}: {length} frames of {height} x {width}, {codes.frame_rate:g} codes/s; "
+        f"{codes.name}: {length} frames of {height} x {width}, {codes.rates}; "
         f"sensor {sensor}, {codes.sensor.bits} bit{light}, white of the sensor = {codes.white:.4g} photons; "
         f"method {method.name} ({method.description}), {seen} for each"
     )

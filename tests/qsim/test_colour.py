@@ -34,7 +34,7 @@ def test_tone_refuses_a_dark_peak():
 
 
 def test_codes_span_the_whole_range():
-    assert code_levels(np.array([0, 7]), 3).tolist() == [0, 255]
+    assert code_levels(np.array([0, 7]), 7).tolist() == [0, 255]
     assert code_levels(np.array([0, 1]), 1).tolist() == [0, 255]
 
 

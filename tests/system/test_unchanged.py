@@ -454,7 +454,7 @@ def video_of_a_notebook(folder: Path) -> Results:
         yield from _video(f"array of {sensor!r}", video, sensor.white(5e-4))
     cube = BinarySPAD(1.0, 0.0, 1).sample_packed(np.repeat(light, 3, axis=0) / 5, 1e-4, key=Key(1, 2))
     np.save(folder / "cube.npy", cube)
-    line = "--width 21 --planes 3 --sensor spad-320x240 --bits 2 --frame-rate 3000 --method moment"
+    line = "--width 21 --planes 3 --sensor spad-320x240 --bits 2 --frame-rate 9000 --method moment"
     yield from _restored(folder / "cube.npy", folder / "out.npy", "photon cube", line)
 
 

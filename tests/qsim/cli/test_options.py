@@ -31,6 +31,7 @@ from qsim.scene.camera_path import write_camera_path
 RENDER = "render fan --frames 2 --height 16 --width 24 --psnr 20"
 STILL = "render still.py --frames 2 --height 16 --width 24 --psnr 20 -o r"
 CODES = "convert codes.npy c --layout codes --bits 3 --frame-rate 9"
+PLANES = "convert lit.npy c --layout codes --bits 1 --frame-rate 9"
 LIGHT = "convert light.npy c --transfer linear --frame-rate 9"
 CALIBRATE = "calibrate --model spad --bits 1 --dark planes.npy 1e-5 --flat lit.npy 1e-5 -o s.toml"
 QIS = "calibrate --bits 3 --dark q0.npy 1e-3 --dark q1.npy 0.2 --flat q2.npy 1e-3 --flat q3.npy 1e-3 -o s.toml"
@@ -338,6 +339,27 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Acts("convert clip e.mp4", "--to png", names),
         Refused(CODES, "--to png", "--to"),
     ],
+    ("convert", "--planes"): [
+        Acts(PLANES, "--planes 7"),
+        Acts("convert clip/streams/b.npy e", "--planes 3", codes=(0, 2)),
+        Refused(CODES, "--planes 7", "--planes"),
+        Refused(LIGHT, "--planes 7", "is light"),
+        Refused("convert clip e", "--planes 7", "name one of its streams"),
+    ],
+    ("convert", "--from"): [
+        Acts(PLANES, "--from 7"),
+        Refused(PLANES, "--from 400", "has planes 0..399"),
+        Refused(LIGHT, "--from 1", "is light"),
+    ],
+    ("convert", "--until"): [
+        Acts(PLANES, "--until 7"),
+        Refused(LIGHT, "--until 1", "is light"),
+    ],
+    ("convert", "--every"): [
+        Acts(PLANES, "--every 7"),
+        Refused(f"{PLANES} --planes 7", "--every 3", "would share planes"),
+        Refused(LIGHT, "--every 2", "is light"),
+    ],
     ("convert", "--window"): [
         Acts("convert clip e.h5", "--window 2", stdout),
         Acts("convert bands e --to challenge", "--window 2", codes=(0, 2)),
@@ -397,6 +419,23 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("preview", "--width"): [
         Acts("preview cube.npy", "--width 13", stdout, codes=(0, 2)),
         Refused("preview clip", "--width 3", "--width"),
+    ],
+    ("preview", "--planes"): [
+        Acts("preview planes.npy --bits 1", "--planes 4", stdout),
+        Refused("preview clip", "--planes 4", "is a clip"),
+        Refused("preview codes.npy --bits 3", "--planes 2", "--planes"),
+    ],
+    ("preview", "--from"): [
+        Acts("preview planes.npy --bits 1", "--from 9", stdout),
+        Refused("preview clip", "--from 1", "is a clip"),
+    ],
+    ("preview", "--to"): [
+        Acts("preview planes.npy --bits 1", "--to 9", stdout),
+        Refused("preview clip", "--to 1", "is a clip"),
+    ],
+    ("preview", "--every"): [
+        Acts("preview planes.npy --bits 1", "--every 9", stdout),
+        Refused("preview clip", "--every 2", "is a clip"),
     ],
     ("preview", "--play"): [
         Acts("preview clip --fps 1000", "--play", exit_code, codes=(0, 2)),
@@ -498,6 +537,18 @@ ROWS: dict[tuple[str, str], list[Row]] = {
             codes=(0, 2),
         ),
         Refused(QIS.replace("calibrate", "calibrate --model qis"), "--planes 50", "--planes"),
+    ],
+    ("calibrate", "--from"): [
+        Acts(CALIBRATE, "--from 100", stdout),
+        Refused("calibrate --bits 8 --static counts.npy 1e-5 -o s.toml", "--from 9", "--static"),
+    ],
+    ("calibrate", "--to"): [
+        Acts(CALIBRATE, "--to 300", stdout),
+        Refused("calibrate --bits 8 --static counts.npy 1e-5 -o s.toml", "--to 9", "--static"),
+    ],
+    ("calibrate", "--every"): [
+        Acts(CALIBRATE, "--every 2", stdout),
+        Refused("calibrate --bits 8 --static counts.npy 1e-5 -o s.toml", "--every 9", "--static"),
     ],
     ("calibrate", "--model"): [Refused("calibrate --bits 8 --static counts.npy 1e-5 -o s.toml", "--model qis", "qis")],
     ("calibrate", "--paralyzable"): [

@@ -73,7 +73,7 @@ def test_codes_in_pictures(tmp_path: Path):
     bits1 = random_planes(2, 5, 7).astype(bool)
     codes = np.random.default_rng(1).integers(0, 8, (2, 5, 7)).astype(np.uint8)
     codes[0, 0, :2] = 0, 7
-    for name, pictures in [("one", bits1), ("three", codes), ("wide", code_levels(codes, 3))]:
+    for name, pictures in [("one", bits1), ("three", codes), ("wide", code_levels(codes, 7))]:
         (tmp_path / name).mkdir()
         images.write_png(tmp_path / name, iter(pictures))
     np.testing.assert_array_equal(everything(tmp_path / "one"), bits1)
@@ -81,7 +81,7 @@ def test_codes_in_pictures(tmp_path: Path):
     np.testing.assert_array_equal(everything(tmp_path / "wide", bits=3, stretched=True), codes)
     with pytest.raises(ValueError, match=r"value \d+ at \(t, y, x\) = .* is not a 3-bit code .* stretched=True"):
         everything(tmp_path / "wide", bits=3)
-    lossy = code_levels(codes, 3)
+    lossy = code_levels(codes, 7)
     lossy[1, 2, 3] ^= 2
     (tmp_path / "lossy").mkdir()
     images.write_png(tmp_path / "lossy", iter(lossy))

@@ -110,6 +110,7 @@ SCORE_NET = "evaluate clip -o table --methods small.safetensors --mode streaming
 SCORE_UNET = "evaluate clip -o table --methods unet.safetensors"
 STORED = "evaluate two -o table --methods naive --stream p3"
 COUNTS = "evaluate --static counts.npy --methods naive --splits 1 --json"
+PLANES = "evaluate --static planes.npy --width 24 --frames 3 --methods naive --splits 1 --json"
 CELLS = "domain unet.safetensors clip --methods naive --json"
 CELLS_NET = "domain small.safetensors clip --methods naive --mode streaming --json"
 SHOW = "domain measured.safetensors"
@@ -285,9 +286,24 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("restore", "--planes"): [
         Acts(CUBE, "--planes 3"),
         Acts(ZIP, "--planes 3"),
-        Refused(BARE, "--planes 3", "give their width"),
-        Refused(CLIP, "--planes 3", "describes a bare array"),
-        Refused(STREAM, "--planes 3", "is a stored stream"),
+        Refused(BARE, "--planes 3", "only a clocked SPAD sums planes"),
+        Refused(CLIP, "--planes 3", "holds codes of 3 bits"),
+        Refused(STREAM, "--planes 3", "holds codes of 3 bits"),
+    ],
+    ("restore", "--from"): [
+        Acts(CUBE, "--from 2"),
+        Acts(STREAM, "--from 2"),
+        Refused(ZIP, "--from 2", "the challenge scores the last plane"),
+    ],
+    ("restore", "--to"): [
+        Acts(CUBE, "--to 4"),
+        Refused(ZIP, "--to 4", "the challenge scores the last plane"),
+        Refused(CUBE, "--to 4000", "give"),
+    ],
+    ("restore", "--every"): [
+        Acts(CUBE, "--every 2"),
+        Refused(f"{CUBE} --planes 3", "--every 2", "would share planes"),
+        Refused(ZIP, "--every 4", "the challenge scores the last plane"),
     ],
     ("restore", "--frame-rate"): [
         Refused(ZIP, "--frame-rate 20", "whose layout states it"),
@@ -380,6 +396,27 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("evaluate", "--frames"): [
         Acts(COUNTS, "--frames 9", static_scores),
         Refused(SCORE, "--frames 9", "belongs to --static"),
+    ],
+    ("evaluate", "--planes"): [
+        Acts(PLANES, "--planes 3", static_scores),
+        Refused(SCORE, "--planes 3", "belongs to --static"),
+        Refused(f"{PLANES} --planes 3", "--bits 2", "are not clipped"),
+    ],
+    ("evaluate", "--width"): [
+        Acts(PLANES.replace(" --width 24", ""), "--width 24", static_scores, codes=(0, 2)),
+        Refused(SCORE, "--width 24", "belongs to --static"),
+    ],
+    ("evaluate", "--from"): [
+        Acts(PLANES, "--from 2", static_scores),
+        Refused(SCORE, "--from 2", "belongs to --static"),
+    ],
+    ("evaluate", "--to"): [
+        Acts(PLANES, "--to 18", static_scores),
+        Refused(SCORE, "--to 18", "belongs to --static"),
+    ],
+    ("evaluate", "--every"): [
+        Acts(PLANES, "--every 2", static_scores),
+        Refused(SCORE, "--every 2", "belongs to --static"),
     ],
     ("evaluate", "--splits"): [
         Acts(COUNTS, "--splits 2", static_scores),
@@ -596,6 +633,7 @@ def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.save(folder / "cubes/fan/000000.npy", rng.integers(0, 256, (6, 5, 2, 3)).astype(np.uint8))
     np.save(folder / "counts.npy", rng.poisson(1.0, (14, 16, 16)))
     np.save(folder / "more.npy", rng.poisson(2.0, (14, 16, 16)))
+    np.save(folder / "planes.npy", np.random.default_rng(1).integers(0, 256, (24, 16, 3)).astype(np.uint8))
     (folder / "spad.toml").write_text('[sensor]\nmodel = "BinarySPAD"\nbits = 1\npde = 0.5\ndark_count_rate = 100.0\n')
     (folder / "carries.toml").write_text(
         '[sensor]\nmodel = "CountingSPAD"\nbits = 3\npde = 0.5\ndark_count_rate = 100.0\ndead_time = 2e-5\n'

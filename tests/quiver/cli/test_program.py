@@ -115,7 +115,7 @@ def test_a_stream_has_one_white(capsys, tmp_path, make_clip):
 def test_a_photon_cube(capsys, tmp_path):
     planes = np.random.default_rng(0).integers(0, 2, (70, 6, 13), dtype=np.uint8)
     np.save(tmp_path / "cube.npy", np.packbits(planes, axis=2))
-    words = ["--width", 13, "--planes", 7, "--sensor", "spad-320x240", "--frame-rate", 1428, "--method", "moment"]
+    words = ["--width", 13, "--planes", 7, "--sensor", "spad-320x240", "--frame-rate", 9996, "--method", "moment"]
     code, out, _ = run(capsys, "restore", tmp_path / "cube.npy", "-o", tmp_path / "v.npy", *words, "--json")
     assert code == 0
     assert json.loads(out)["white"] == pytest.approx(7.0)

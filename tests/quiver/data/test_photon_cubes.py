@@ -7,23 +7,24 @@ import pytest
 from clips import packed
 from numpy import ndarray as Array
 
-from quiver.cli.program import main
+from qsim.streams.plane_sums import PlaneSums
 from quiver.data.illumination import Illumination
-from quiver.data.photon_cubes import cube_codes, plane_bits
+from quiver.data.photon_cubes import cube_codes
 
-VALID = [2**b - 1 for b in range(1, 17)]
+DEPTHS = [2**b - 1 for b in range(1, 17)]
+OTHERS = [2, 5, 10, 100, 256, 1000]
 
 SPAD = Illumination.of("spad-320x240", None, None)
 
 
-@pytest.mark.parametrize("planes", VALID)
+@pytest.mark.parametrize("planes", [*DEPTHS, *OTHERS])
 def test_sums_of_planes_are_plain_sums(tmp_path, planes):
-    """Every depth from 1 to 16 bits, a width that fills no byte, planes left over; full and random planes."""
+    """Every depth from 1 to 16 bits, others, a width that fills no byte, planes left over; full and random planes."""
     rng = np.random.default_rng(planes)
     height, width, frames = (2, 5, 3) if planes < 5000 else (1, 3, 1)
     drawn = rng.integers(0, 2, (planes * frames + min(planes - 1, 2), height, width), dtype=np.uint8)
     drawn[:planes] = 1  # the first code is the top one: where a narrow type wraps
-    codes = cube_codes(packed(drawn, tmp_path / "c.npy"), SPAD, 1000.0, planes=planes, width=width)
+    codes = cube_codes(packed(drawn, tmp_path / "c.npy"), SPAD, 1000.0, sums=PlaneSums(planes=planes), width=width)
     expected = drawn[: planes * frames].reshape(frames, planes, height, width).astype(np.int64).sum(axis=1)
     assert codes.shape == expected.shape
     assert codes.sensor.bits == planes.bit_length()
@@ -37,28 +38,11 @@ def test_sums_of_planes_are_plain_sums(tmp_path, planes):
 def test_planes_unpacked_in_pieces_are_the_same(tmp_path, monkeypatch):
     drawn = np.random.default_rng(1).integers(0, 2, (511 * 2, 3, 11), dtype=np.uint8)
     path = packed(drawn, tmp_path / "c.npy")
-    whole = cube_codes(path, SPAD, 1000.0, planes=511, width=11).read(0, 2)
-    monkeypatch.setattr("quiver.data.photon_cubes.PLANE_PIXELS", 3 * 11 * 7)
-    np.testing.assert_array_equal(cube_codes(path, SPAD, 1000.0, planes=511, width=11).read(0, 2), whole)
-
-
-def test_plane_counts_that_no_code_sums_are_refused(tmp_path, capsys):
-    """1 to 1000 and beyond the deepest code: 2^b - 1 is taken, everything else is refused with its neighbours."""
-    for planes in [*range(1, 1001), 65534, 65535, 65536, 10**9]:
-        if planes in VALID:
-            assert 2 ** plane_bits(planes) - 1 == planes
-            continue
-        with pytest.raises(ValueError, match=rf"got {planes}; use ") as caught:
-            plane_bits(planes)
-        near = [int(word) for word in str(caught.value).rsplit("use ", 1)[1].split(" or ")]
-        below = max(v for v in VALID if v < planes)
-        above = min((v for v in VALID if v > planes), default=None)
-        assert near == [v for v in (below, above) if v is not None]
-    path = packed(np.ones((10, 4, 8), np.uint8), tmp_path / "c.npy")
-    words = ["restore", path, "--width", 8, "--planes", 5, "--sensor", "spad-320x240", "--method", "naive"]
-    assert main([str(word) for word in [*words, "-o", tmp_path / "r.npy"]]) == 2
-    assert capsys.readouterr().err.endswith("sums 2^b - 1 binary planes, got 5; use 3 or 7\n")
-    assert not (tmp_path / "r.npy").exists()
+    whole = cube_codes(path, SPAD, 1000.0, sums=PlaneSums(planes=511), width=11).read(0, 2)
+    monkeypatch.setattr("qsim.streams.plane_sums.PLANE_PIXELS", 3 * 11 * 7)
+    np.testing.assert_array_equal(
+        cube_codes(path, SPAD, 1000.0, sums=PlaneSums(planes=511), width=11).read(0, 2), whole
+    )
 
 
 def test_binary_planes_are_codes_of_one_bit(tmp_path):
@@ -69,7 +53,11 @@ def test_binary_planes_are_codes_of_one_bit(tmp_path):
 @pytest.mark.parametrize(
     ("light", "planes", "message"),
     [
-        (Illumination.of("spad-320x240", None, 3), 15, "sums of 15 planes are 4-bit codes, got bits = 3"),
+        (
+            Illumination.of("spad-320x240", None, 3),
+            15,
+            "bits: 3: a plane has 1 bit and a sum of 15 has 4; leave it out",
+        ),
         (
             Illumination.of("quiver-paper", None, None),
             7,
@@ -80,7 +68,7 @@ def test_binary_planes_are_codes_of_one_bit(tmp_path):
 def test_a_sensor_that_cannot_have_made_the_sums_is_refused(tmp_path, light, planes, message):
     path = packed(np.ones((30, 3, 9), np.uint8), tmp_path / "c.npy")
     with pytest.raises(ValueError, match=message):
-        cube_codes(path, light, 1000.0, planes=planes, width=9)
+        cube_codes(path, light, 1000.0, sums=PlaneSums(planes=planes), width=9)
 
 
 def test_an_archive_under_the_name_of_an_array_is_named(tmp_path):
@@ -94,14 +82,16 @@ def test_photon_cubes(tmp_path, rng_planes: Array):
     """Packed planes, seven to a code; a width that is no multiple of eight; leftover planes are dropped."""
     np.save(tmp_path / "cube.npy", np.packbits(rng_planes, axis=2))
     light = Illumination.of("spad-320x240", None, 3)
-    codes = cube_codes(tmp_path / "cube.npy", light, 1428.0, planes=7, width=13)
+    codes = cube_codes(tmp_path / "cube.npy", light, 1428.0, sums=PlaneSums(planes=7), width=13)
     assert codes.shape == (2, 5, 13)
     np.testing.assert_array_equal(codes.read(0, 2), rng_planes[:14].reshape(2, 7, 5, 13).sum(axis=1))
     assert codes.white == pytest.approx(7.0)
     with pytest.raises(ValueError, match=r"is not a cube of packed planes 30 px wide"):
-        cube_codes(tmp_path / "cube.npy", light, 1428.0, planes=7, width=30)
+        cube_codes(tmp_path / "cube.npy", light, 1428.0, sums=PlaneSums(planes=7), width=30)
     with pytest.raises(ValueError, match="fewer than the 31 of one code"):
-        cube_codes(tmp_path / "cube.npy", Illumination.of("spad-320x240", None, 5), 300.0, planes=31, width=13)
+        cube_codes(
+            tmp_path / "cube.npy", Illumination.of("spad-320x240", None, 5), 300.0, sums=PlaneSums(planes=31), width=13
+        )
 
 
 @pytest.fixture

@@ -1,0 +1,134 @@
+"""Planes of recordings become codes: against plain loops, with both rates in every output."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy import ndarray as Array
+
+import quiver
+from qsim import BinarySPAD, PlaneSums, Stream
+from qsim.cli import main
+from qsim.clip.source import Times
+from quiver.cli import main as quiver_main
+
+RATE = 10000.0
+
+
+@pytest.fixture
+def planes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Array:
+    """Planes [60, 5, 13] as a bare array, packed, and imported."""
+    monkeypatch.chdir(tmp_path)
+    drawn = np.random.default_rng(0).integers(0, 2, (60, 5, 13), dtype=np.uint8)
+    np.save("flat.npy", drawn)
+    np.save("cube.npy", np.packbits(drawn, axis=2))
+    assert main(f"convert cube.npy cap --layout cube --width 13 --frame-rate {RATE} -q".split()) == 0
+    return drawn
+
+
+def by_hand(planes: Array, sums: PlaneSums) -> list[Array]:
+    """The sums of planes by a plain loop."""
+    count = sums.planes or 1
+    at = sums.start or 0
+    stop = len(planes) if sums.stop is None else sums.stop
+    found = []
+    while at + count <= stop:
+        found.append(planes[at : at + count].sum(axis=0))
+        at += sums.every or count
+    return found
+
+
+def test_random_sums_are_those_of_a_loop():
+    rng = np.random.default_rng(1)
+    drawn = rng.integers(0, 2, (80, 2, 3), dtype=np.uint8)
+    for _ in range(60):
+        count = int(rng.integers(1, 12))
+        asked = PlaneSums(int(rng.integers(0, 20)), int(rng.integers(40, 81)), count + int(rng.integers(0, 5)), count)
+        taken = asked.over(80, "planes")
+        expected = by_hand(drawn, asked)
+        assert taken.codes == len(expected)
+        np.testing.assert_array_equal(taken.of(lambda a, b: drawn[a:b])(0, taken.codes), expected)
+        stamps = taken.times(1000.0, Times(tuple(np.arange(80.0) * 3), "us", "clock")).values
+        middles = [3 * (asked.start + t * asked.every + (count - 1) / 2) for t in range(taken.codes)]
+        np.testing.assert_allclose(stamps, middles)
+
+
+LINE = "--planes 10 --from 3 --{} 58 --every 11"
+ASKED = PlaneSums(3, 58, 11, 10)
+SAID = "10 planes per code, one code every 11 planes, 10000 planes/s, 909.091 codes/s"
+
+
+@pytest.mark.parametrize("source", ["cap.npy", "flat.npy --frame-rate 1e4", "cube.npy --width 13 --frame-rate 1e4"])
+def test_a_recording_is_restored_from_its_sums(planes, source, capsys):
+    own = "" if source == "cap.npy" else "--sensor spad-320x240"
+    line = f"restore {source} {own} -o r.npy --method moment:3 {LINE.format('to')}"
+    assert quiver_main(line.split()) == 0
+    said = capsys.readouterr()
+    assert SAID in said.out
+    assert SAID in said.err
+    codes = np.array(by_hand(planes, ASKED)).astype(np.uint8)
+    sensor = BinarySPAD(1.0, 0.0).of_planes(10)
+    np.testing.assert_array_equal(np.load("r.npy"), quiver.restore(codes, "moment:3", sensor=sensor, exposure=1e-3))
+    found = json.loads(Path("r.json").read_text())
+    assert (found["plane_rate"], found["planes_per_code"], found["exposure"]) == (RATE, 10, 1e-3)
+    np.testing.assert_allclose(found["times"]["values"], (3 + 5 + 11 * np.arange(5)) / RATE)
+
+
+def test_sums_are_converted_and_shown(planes, capsys):
+    """From a foreign file and from our stream: the same codes, and both rates of each."""
+    line = LINE.format("until")
+    assert main(f"convert cap.npy ours {line}".split()) == 0
+    assert main(f"convert cube.npy theirs --layout cube --width 13 --frame-rate {RATE} {line}".split()) == 0
+    assert main(f"preview cap.npy -o p.png {LINE.format('to')}".split()) == 0
+    assert capsys.readouterr().out.count(SAID) == 3
+    for name in ("ours", "theirs"):
+        stream = Stream.open(f"{name}.json")
+        np.testing.assert_array_equal(stream.codes(0, 5), by_hand(planes, ASKED))
+        assert (stream.sensor.levels, stream.exposure, stream.rates) == (11, 1e-3, SAID)
+    assert quiver_main(["restore", "ours.npy", "-o", "r.npy", "--method", "moment", "-q"]) == 0
+    assert SAID in capsys.readouterr().out
+    assert main(["convert", "cap.npy", "e.png", "--to", "png", "--planes", "7"]) == 0
+    assert "7 planes per code, 10000 planes/s, 1428.57 codes/s" in capsys.readouterr().out
+
+
+def test_a_sensor_file_clashes_with_its_own_bits_alone(planes, capsys):
+    """A file of no bits serves every depth; one of a plane or of the sum fits; another gives the cure."""
+    text = '[sensor]\nmodel = "BinarySPAD"\npde = 0.5\ndark_count_rate = 10.0\n'
+    line = "restore cube.npy --width 13 --sensor {}.toml --planes 7 -o r.npy --method moment --force -q"
+    for bits in ("", "bits = 1", "bits = 3"):
+        Path("a.toml").write_text(f"{text}{bits}\n")
+        assert quiver_main(line.format("a").split()) == 0
+    Path("b.toml").write_text(f"{text}bits = 4\n")
+    assert quiver_main(line.format("b").split()) == 2
+    assert "--bits: 4 in b.toml: a plane has 1 bit and a sum of 7 has 3; leave it out" in capsys.readouterr().err
+    words = ["restore", "flat.npy", "--sensor", "b.toml", "--bits", "3", "-o", "s.npy", "--method", "moment", "-q"]
+    assert quiver_main(words) == 2
+    assert "or delete the line of bits: such a file serves every depth" in capsys.readouterr().err
+
+
+def test_single_planes_are_calibrated_as_sums(planes, capsys):
+    """`--bits 1 --planes 3` of planes finds the rate of `--planes 3` of their sums; a stream states its bit."""
+    np.save("sums.npy", planes.reshape(20, 3, 5, 13).sum(axis=1).astype(np.uint8))
+    found = []
+    for source, bits in (("sums.npy", ""), ("flat.npy", "--bits 1"), ("cap.npy", ""), ("cube.npy --width 13", "")):
+        name, *more = source.split()
+        line = f"calibrate --planes 3 {bits} --dark {name} 1e-4 {' '.join(more)} -o s.toml --json --force"
+        assert main(line.split()) == 0
+        found.append(json.loads(capsys.readouterr().out)["values"]["dark_count_rate"])
+    assert all(value == found[0] for value in found)
+    assert "bits" not in Path("s.toml").read_text().split("[sources]")[0]
+
+
+def test_sums_of_a_still_scene_are_scored_against_the_light_behind_their_saturation(tmp_path, capsys):
+    """The mean of all planes as the reference: unbiased by saturation, so `moment` has the factor 1 and `naive` not."""
+    light = 0.3 + 0.25 * np.sin(np.arange(20) / 3)
+    drawn = np.random.default_rng(2).random((1500, 24, 20)) < -np.expm1(-light)
+    np.save(tmp_path / "still.npy", np.packbits(drawn, axis=2))
+    line = f"evaluate --static {tmp_path}/still.npy --width 20 --planes 10 --methods moment,naive --json"
+    assert quiver_main(line.split()) == 0
+    moment, naive = json.loads(capsys.readouterr().out)["scores"]
+    assert abs(moment["scale"] - 1) < 0.05  # 11 codes of 10 planes: 2 % in the mean of 480 pixels, at most
+    assert naive["scale"] > 1.1
