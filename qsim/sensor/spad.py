@@ -85,6 +85,10 @@ class BinarySPAD(SPAD):
         if self.summed == (1 << self.bits) - 1:
             object.__setattr__(self, "summed", None)  # one sensor has one form
 
+    def __repr__(self) -> str:
+        values = (f"{name}={value!r}" for name, value in vars(self).items() if value is not None)
+        return f"{type(self).__name__}({', '.join(values)})"
+
     @property
     def planes(self) -> int:
         """Return the number of binary planes in one code, M = 2^bits - 1 unless `summed` is given."""
