@@ -367,6 +367,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         "--ppp", "9", Acts(SCORE, "--ppp 3.25,9", scores), Refused(STORED, "--ppp 9", "is stored")
     ),
     ("evaluate", "--bits"): [
+        Refused(f"{PLANES} --planes 3", "--bits 2", "are not clipped"),
         Acts(SCORE, "--bits 1,3", scores),
         Acts(COUNTS, "--bits 1", static_scores),
         Refused(COUNTS, "--bits 1,3", "give one number"),
@@ -400,7 +401,6 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("evaluate", "--planes"): [
         Acts(PLANES, "--planes 3", static_scores),
         Refused(SCORE, "--planes 3", "belongs to --static"),
-        Refused(f"{PLANES} --planes 3", "--bits 2", "are not clipped"),
     ],
     ("evaluate", "--width"): [
         Acts(PLANES.replace(" --width 24", ""), "--width 24", static_scores, codes=(0, 2)),
