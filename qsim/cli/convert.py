@@ -86,7 +86,7 @@ class Convert:
     @property
     def source(self) -> Path:
         """The input; of a stream its description, which the .npy of its codes names too."""
-        beside = self.input.with_suffix(".json")
+        beside = _description(self.input)
         return beside if self.input.suffix == ".npy" and _is_stream(beside) else self.input
 
     @property
@@ -296,9 +296,14 @@ def _check_names(folder: Path, pairs: list[tuple[Path, Path]]) -> None:
             raise ValueError(f"{folder}: {other} and {source} would both become {target}; rename one of them")
 
 
+def _description(path: Path) -> Path:
+    """Return the file that describes an array of ours, beside it."""
+    return path.parent / f"{path.stem}.json"
+
+
 def _restored(source: Path) -> dict[str, Any]:
     """Return the description of restored video (`quiver restore`), which states its rates; else an empty one."""
-    beside = source.with_suffix(".json")
+    beside = _description(source)
     found = files.read_json(beside) if source.suffix == ".npy" and beside.is_file() else {}
     return found if describes_restored(found) else {}
 

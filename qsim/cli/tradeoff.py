@@ -173,7 +173,8 @@ def tradeoff(asked: Tradeoff) -> int:
         raise ValueError("give a clip or a scene, --table, or --paper-figure; see qsim tradeoff --help")
     if asked.output is None:
         if asked.streams or asked.paper_figure:
-            raise ValueError("give a folder with -o, as in -o out/bits")
+            option = "--streams" if asked.streams else "--paper-figure"
+            raise ValueError(f"{option}: writes files; give a folder with -o, as in -o out/bits")
     else:
         check_free(asked.output)
         for written in (f"{name}.json", *PICTURES.get(name, (f"{name}.png",))):

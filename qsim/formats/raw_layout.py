@@ -125,7 +125,10 @@ def read_raw(path: Path, hints: Hints) -> Recording:
     assert hints.width is not None
     assert hints.bits is not None
     convert(hints.bits, Bits, f"{path}: bits")
-    if hints.order is not None and hints.endian is not None and hints.bits != 8:
+    for name in ("order", "endian"):
+        if hints.bits == 8 and getattr(hints, name) is not None:
+            raise ValueError(f"{path}: {name}= changes nothing for pixels of 8 bits; leave it out")
+    if hints.order is not None and hints.endian is not None:
         raise ValueError(f"{path}: order= states packed pixels, endian= pixels of whole bytes; leave one of them out")
     layout = _with_gaps(Layout(hints.height, hints.width, hints.bits), hints)
     if hints.bits == 1 or (hints.bits not in (8, 16) and hints.endian is None):
@@ -137,8 +140,6 @@ def read_raw(path: Path, hints: Hints) -> Recording:
         if hints.endian is None:
             raise ValueError(f"{path}: pixels of 16 bits; add endian=little or endian=big")
         layout = replace(layout, endian=_one_of(path, "endian", hints.endian, ENDIANS))
-    else:
-        _ = hints.endian  # 8 bits or fewer in a byte each
     return _recording(path, raw_files(path), layout, "raw", hints)
 
 

@@ -48,7 +48,7 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     filters = _fitting_filters(clip, sensing, own is not None)
     planes = sensing.planes
     if sensing.group and sensing.depth is None:
-        raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in bits=3")
+        raise ValueError(f"{clip.name}: group= sums planes, and needs the bits of a code, as in bits=3")
     if not 1 <= planes <= len(clip):
         what = f"one code of {planes} planes" if sensing.group else f"one exposure of {planes} slices"
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
@@ -129,9 +129,9 @@ def _check_planes(sensor: Sensor, sensing: Sensing, clip: ClipFolder) -> None:
     """Raise `ValueError` if sums of planes or slices of exposures do not fit the sensor or the clip."""
     kind = type(sensor).__name__
     if sensing.follow and not sensor.follows_photons:
-        raise ValueError(f"{sensing.sensor_name}: only the photons of a CountingSPAD are followed, this is a {kind}")
+        raise ValueError(f"{sensing.sensor_name}: follow= is for the photons of a CountingSPAD, this is a {kind}")
     if sensing.group and not sensor.sums_planes:
-        raise ValueError(f"{sensing.sensor_name}: only a clocked SPAD (BinarySPAD) sums planes, this is a {kind}")
+        raise ValueError(f"{sensing.sensor_name}: group= is for a clocked SPAD (BinarySPAD), this is a {kind}")
     if sensing.slices > 1 and not sensor.takes_slices:
         raise ValueError(
             f"{sensing.sensor_name}: slices of an exposure are for a CountingSPAD or a QIS, this is a {kind}"

@@ -146,7 +146,7 @@ MISTAKES = [
     ),
     ("qsim sense lit --ppp 3 --sensor noise.sensor.toml", "QIS.read_noise is a number, at least 0; got -0.2"),
     ("qsim sense lit --ppp 3 --name a/b", "name: expected a"),
-    ("qsim sense lit --ppp 3 --group", "summing planes needs the bits of a code, as in --bits 3"),
+    ("qsim sense lit --ppp 3 --group", "--group sums planes, and needs the bits of a code, as in --bits 3"),
     ("qsim sense none --ppp 3", "none: no such clip"),
     ("qsim sense . --ppp 3", ".: not a clip folder (it has no clip.json)"),
     ("qsim sense lit --ppp 3 --sensor none.toml", "none.toml: no such sensor file"),
@@ -162,7 +162,7 @@ MISTAKES = [
     ),
     ("qsim sense lit --ppp 3 --sensor iso.sensor.toml", "iso needs a full_well above 0 and codes above the offset"),
     ("qsim convert lit x.dat", "lit: a spike file holds one bit per pixel, this is light; name a stream of one bit"),
-    ("qsim sense lit --ppp 3 --follow", "only the photons of a CountingSPAD are followed, this is a QIS"),
+    ("qsim sense lit --ppp 3 --follow", "--follow is for the photons of a CountingSPAD, this is a QIS"),
     ("qsim convert lit x.npz", "lit: a clip has light, and no single photons; name one of its streams"),
     ("qsim compare lit --span 1", "has no streams to compare; make some with `qsim sense`"),
     # What is in the way

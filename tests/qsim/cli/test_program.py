@@ -240,7 +240,7 @@ def test_a_sum_of_planes_groups_clip_frames(tmp_path: Path, capsys: pytest.Captu
     assert run(capsys, "sense", tmp_path / "fast", "-o", "sum", "--replay", "fast:1")[0] == 0
     code, _, err = run(capsys, "sense", tmp_path / "fast", "--bits", 3, "--ppp", 3, "--group")
     assert code == 2
-    assert "only a clocked SPAD (BinarySPAD) sums planes" in err
+    assert "--group is for a clocked SPAD (BinarySPAD)" in err
 
 
 def test_check_names_the_damage(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
