@@ -33,6 +33,7 @@ from quiver.data.stream_windows import StreamWindows
 from quiver.data.windows import Batches, Windows, WindowSettings
 from quiver.device import is_gpu, moved
 from quiver.evaluation import metrics
+from quiver.host import flushed_denormals
 from quiver.training.optimiser import Optimiser
 from quiver.training.processes import Process, begin_worker, joined, plain_errors
 from quiver.training.run_folder import Run
@@ -304,11 +305,12 @@ def train(
 
     A run in `settings.out` is resumed; `force` starts it again from the beginning. `note` receives lines about the
     noise of the windows, missing clips, and the step from which the run goes. ValueError and OSError for settings and
-    folders that do not fit, `Diverged` for NaN or Inf. The call sets torch's number of threads, and makes denormal
-    numbers zero in this process.
+    folders that do not fit, `Diverged` for NaN or Inf. During the call torch has the number of threads that the
+    settings ask for, and denormal numbers are zero in this thread.
     """
-    torch.set_flush_denormal(True)  # gradients in the tails of GELU are denormal and slow down a step
     with joined(device) as process, contextlib.ExitStack() as stack:
+        stack.enter_context(flushed_denormals())  # gradients in the tails of GELU are denormal and slow down a step
+        stack.callback(torch.set_num_threads, torch.get_num_threads())
         asked = settings.threads
         system = system_of(model)
         system.refuse(model, settings)

@@ -117,3 +117,14 @@ def test_other_threads_keep_the_type_of_the_host():
 def test_nothing_is_intercepted_in_a_quiet_program():
     with nullcontext(), host.numbers():
         assert torch.overrides._get_current_function_mode_stack() == []
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_denormal_numbers_are_what_they_were(before):
+    torch.set_flush_denormal(before)
+    try:
+        with host.flushed_denormals():
+            assert torch.tensor(5e-324, dtype=torch.float64) * 1.0 == 0.0
+        assert (np.float64(5e-324) * np.float64(1.0) == 0.0) is np.bool_(before)
+    finally:
+        torch.set_flush_denormal(False)

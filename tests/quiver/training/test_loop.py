@@ -147,6 +147,16 @@ def test_a_run_is_replaced_only_by_one_that_can_start(tiny_dataset, tmp_path, mo
 
 
 @pytest.mark.slow
+def test_a_run_leaves_its_process_as_it_was(tiny_dataset, tmp_path):
+    """Threads of torch and denormal numbers, whether it ends or fails."""
+    before = torch.get_num_threads()
+    train(small_network(), settings(tiny_dataset, tmp_path / "r", steps=1, threads=before + 1), progress=False)
+    with pytest.raises(ValueError, match="crop"):
+        train(small_network(), settings(tiny_dataset, tmp_path / "s", crop=18), progress=False)
+    assert torch.get_num_threads() == before
+    assert torch.tensor(5e-324, dtype=torch.float64) * 1.0 > 0
+
+
 def test_workers_do_not_change_the_run(tiny_dataset, tmp_path):
     alone = small_network()
     helped = small_network()
