@@ -1,4 +1,4 @@
-"""Options of training and measuring commands: each has an effect, or is refused in one line and changes nothing."""
+"""Tests what training and measuring commands say of their options, of interrupts and of errors."""
 
 from __future__ import annotations
 
@@ -37,63 +37,10 @@ def told(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     return err
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--minutes", "1", "--validate-every", "5"], "--validate-every: counts steps of a run with --steps"),
-        ([*FAST, "--threads", "0"], "argument --threads: expected a whole number from 1, got '0'"),
-        ([*FAST, "--threads", "9999"], "--threads 9999: this machine has"),
-        ([*FAST, "--crop", "18"], "--crop 18: this network needs a multiple of 4"),
-        ([*FAST, "--sensor", "spad-320x240,nosuch"], "unknown sensor 'nosuch'"),
-        ([*FAST, "--sensor", "nosuch.toml"], "nosuch.toml: no such sensor file"),
-        ([*FAST, "--bits", "17"], "17"),
-        ([*FAST, "--sensor", "a,,b"], "expected values with commas between them"),
-    ],
-)
-def test_what_cannot_act_is_refused(capsys, tiny_dataset, tmp_path, monkeypatch, words, message):
-    monkeypatch.chdir(tmp_path)
-    assert message in told(capsys, "train", tiny_dataset, "-o", "r", *words)
-    assert list(tmp_path.iterdir()) == []
-
-
 def trained(data: Path, out: Path, *words: str) -> dict[str, torch.Tensor]:
     torch.manual_seed(0)
     assert main(["train", str(data), "-o", str(out), *FAST, *words, "-q"]) == 0
     return load_file(out / "last.safetensors")
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--sensor", "quiver-published"],
-        ["--sensor", "quiver-physical,quiver-published"],
-        ["--ppp", "1,10"],
-        ["--ppp", "0.3..100"],
-        ["--bits", "1"],
-        ["--bits", "1,3"],
-        *(
-            pytest.param(more, marks=pytest.mark.slow)
-            for more in (
-                ["--crop", "24"],
-                ["--frames", "12"],
-                ["--batch", "2"],
-                ["--optimiser", "muon"],
-                ["--learning-rate", "0.01"],
-                ["--loss", "published"],
-                ["--loss", "paper"],
-                ["--precision", "bfloat16"],
-                ["--seed", "1"],
-                ["--steps", "3"],
-                ["--protocol", "quick"],
-            )
-        ),
-    ],
-    ids=" ".join,
-)
-def test_an_option_changes_the_weights(tiny_dataset, tmp_path, words):
-    plain = trained(tiny_dataset, tmp_path / "a")
-    other = trained(tiny_dataset, tmp_path / "b", *words)
-    assert any(not torch.equal(plain[name], other[name]) for name in plain)
 
 
 def test_a_run_knows_its_first_weights_by_what_decides_results(capsys, tiny_dataset, tmp_path):
