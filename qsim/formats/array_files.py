@@ -74,7 +74,9 @@ def read_cube(path: Path, hints: Hints) -> Recording:
     known = written_with(path, description) or {}
     width = hints.width if hints.width is not None else known.get("shape", (0, 0, 8 * columns))[2]
     if not 8 * (columns - 1) < width <= 8 * columns:
-        raise ValueError(f"{path}: {columns} bytes per row hold {8 * columns - 7} to {8 * columns} pixels, not {width}")
+        raise ValueError(
+            f"{path}: {columns} bytes per row hold {8 * columns - 7} to {8 * columns} pixels, not width={width}"
+        )
 
     def read(start: int, stop: int) -> Array:
         return np.unpackbits(np.asarray(array[start:stop]), axis=-1, count=width)

@@ -169,6 +169,8 @@ def _array_source(
     rate = None if video is None else video.frame_rate
     if array.dtype.kind == "f":
         _refuse(path, "an array of values, not of codes", bits=bits, width=width)
+        if sums.any:
+            raise ValueError(f"{path}: is an array of values, and planes are summed in a recording of codes")
         title = "values" if video is None else f"restored by {video.method}"
         unit = "as stored" if video is None else video.unit
         view = _light_view("values", title, unit, length, lambda t: np.asarray(array[t], np.float64))

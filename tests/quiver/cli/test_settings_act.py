@@ -110,6 +110,7 @@ SCORE_NET = "evaluate clip -o table --methods small.safetensors --mode streaming
 SCORE_UNET = "evaluate clip -o table --methods unet.safetensors"
 STORED = "evaluate two -o table --methods naive --stream p3"
 COUNTS = "evaluate --static counts.npy --methods naive --splits 1 --json"
+PLANES = "evaluate --static planes.npy --width 24 --frames 3 --methods naive --splits 1 --json"
 CELLS = "domain unet.safetensors clip --methods naive --json"
 CELLS_NET = "domain small.safetensors clip --methods naive --mode streaming --json"
 SHOW = "domain measured.safetensors"
@@ -184,6 +185,8 @@ SITUATIONS = (
     needs(SCORE.replace(" -o table", ""), "output"),
     Situation(SCORE, scores, only=("methods",)),
     Situation(COUNTS, static_scores, only=("methods",)),
+    Situation(PLANES, static_scores, {"start": "2", "stop": "18", "every": "2"}),
+    Situation(PLANES.replace(" --width 24", ""), static_scores, {"width": "24"}, only=("width",)),
     Situation(SCORE_NET, scores),
     Situation(SCORE_NET.replace(" --mode streaming", ""), scores, {"mode": "streaming"}, only=("mode",)),
     Situation(SCORE_UNET, scores),
@@ -250,7 +253,8 @@ COMMANDS = Commands(
         "sensor": "quiver-published",
         "size": "24x16",
         "split": "val",
-        "start": "trained",
+        "train.start": "trained",
+        "start": "2",
         "static": "counts.npy",
         "stream": "p1",
         "temperature": "30",
@@ -360,6 +364,7 @@ def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_clip(folder / "short", frames=5, height=16, width=24)
     write_clip(folder / "large", frames=11, height=88, width=88)
     np.save(folder / "codes.npy", rng.integers(0, 2, (12, 16, 24)).astype(np.uint8))
+    np.save(folder / "planes.npy", rng.integers(0, 256, (24, 16, 3)).astype(np.uint8))
     np.save(folder / "bad.npy", rng.random((16, 24)) < 0.1)
     np.save(folder / "small.npy", np.ones((8, 8), bool))
     np.save(folder / "cube.npy", rng.integers(0, 256, (12, 16, 3)).astype(np.uint8))
