@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,7 +92,7 @@ def generate(asked: Generate) -> int:
     lines += [f"repaired {problem}" for problem in summary.repaired]
     lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]
     lines += [f"SHARED {problem}" for problem in summary.shared]
-    lines += _noisy(folder, chosen)
+    lines += [*_limits(folder, chosen), *_noisy(folder, chosen)]
     if summary.failed:
         lines.append("run again with --retry after removing the cause")
     output({"dataset": str(folder)} | dataclasses.asdict(summary), lines)
@@ -114,6 +115,18 @@ def _defaults(wanted: Recipe) -> str:
     ]
     taken += ["seed = 0"] if source.recipe.seed is None else []
     return f"; by default {', '.join(taken)}" if taken else ""
+
+
+def _limits(folder: Path, jobs: list[Job]) -> list[str]:
+    """Return a line that states which limit, dB or PPP, decided the samples of how many finished clips."""
+    from qsim.clip.manifest import read_info
+    from qsim.rendering.budget import deciding
+
+    described = (folder / "clips" / job.name / "clip.json" for job in jobs)
+    renders = [read_info(path).render for path in described if path.is_file()]
+    found = Counter(limit for render in renders if render and (limit := deciding(render.findings)))
+    counted = ", ".join(f"{limit} in {clips} clip{'s' * (clips != 1)}" for limit, clips in sorted(found.items()))
+    return [f"the samples follow from {counted}"] if found else []
 
 
 def _noisy(folder: Path, jobs: list[Job]) -> list[str]:

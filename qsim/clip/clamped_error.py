@@ -10,7 +10,7 @@ around the one that the pilot predicted, and the clip interpolates at its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +43,34 @@ class Errors:
         squares = (halves[0] - halves[1]) ** 2 / 4
         clamped = clamped_squares(squares, picture, halves.min(axis=0), white)
         return cls(math.sqrt(float(clamped.mean())), math.sqrt(float(squares.mean())))
+
+
+@dataclass(frozen=True)
+class StatedError:
+    """The error of a picture, rms in W m^-2 sr^-1: without a clamp, and clamped at some whites."""
+
+    plain: float
+    at_whites: tuple[tuple[float, float], ...] = ()  # (white, error clamped there) of rising white; none without light
+
+    @classmethod
+    def of(cls, plain: float, at_whites: Sequence[Sequence[float]]) -> StatedError:
+        """Return the error of any sequences."""
+        return cls(plain, tuple((float(white), float(error)) for white, error in at_whites))
+
+    def at(self, white: float) -> float:
+        """Return the error clamped at a white; beyond the largest white the plain one, which is never smaller."""
+        known = len(self.at_whites) and white <= self.at_whites[-1][0]
+        return error_at(white, self.at_whites) if known else self.plain
+
+    def and_more(self, more: float) -> StatedError:
+        """Return the error with an independent one in addition."""
+        at_whites = tuple((white, math.hypot(at_white, more)) for white, at_white in self.at_whites)
+        return StatedError(math.hypot(self.plain, more), at_whites)
+
+    def or_larger(self, other: StatedError) -> StatedError:
+        """Return the larger of two errors, at each white of the first."""
+        at_whites = tuple((white, max(found, other.at(white))) for white, found in self.at_whites)
+        return StatedError(max(self.plain, other.plain), at_whites)
 
 
 def rms(difference: Array) -> float:
@@ -108,26 +136,30 @@ def measured(
     errors: Sequence[float],
     errors_at: Sequence[Sequence[Sequence[float]]],
     shares: bool = False,
+    codes: Mapping[int, StatedError] | None = None,
 ) -> ErrorInfo:
     """Return what clip.json states of the errors of a clip's frames.
 
     `means` are the mean radiances of the frames, `high` is the 99.9th percentile of all. `errors` holds the plain error
     of each frame, `errors_at` its pairs (white, error). Where none reaches the white of the clip, the plain error
-    is taken, which is never smaller. `shares` states whether the frames share samples.
+    is taken, which is never smaller. `shares` states whether the frames share samples. `codes` are the errors of codes
+    by their middle frame, where frames share the noise of a code: the PSNR is that of the codes.
     """
     white = white_of(math.fsum(means) / len(means), high)
+    whole = dict(sorted((codes or {}).items()))
+    of_codes = [error.plain for error in whole.values()]
     if not white > 0:
-        return ErrorInfo(error_per_frame=tuple(errors), white=white)
-    own = [
-        error_at(white, pairs) if len(pairs) and white <= pairs[-1][0] else plain
-        for plain, pairs in zip(errors, errors_at, strict=True)
-    ]
+        return ErrorInfo(error_per_frame=tuple(errors), error_per_code=tuple(of_codes), white=white)
+    own = [StatedError.of(*both).at(white) for both in zip(errors, errors_at, strict=True)]
+    own_codes = [error.at(white) for error in whole.values()]
     return ErrorInfo(
         error_per_frame=tuple(errors),
         white=white,
         error_at_white_per_frame=tuple(over_neighbours(own, means, shares)),
-        psnr_of_truth=_stored(psnr(white, rms(np.array(own)))),
-        psnr_unclamped=_stored(psnr(white, rms(np.array(errors)))),
+        error_per_code=tuple(of_codes),
+        error_at_white_per_code=tuple(over_neighbours(own_codes, [means[t] for t in whole])),
+        psnr_of_truth=_stored(psnr(white, rms(np.array(own_codes or own)))),
+        psnr_unclamped=_stored(psnr(white, rms(np.array(of_codes or errors)))),
     )
 
 
@@ -143,11 +175,13 @@ class Stated:
     psnr: float
     unclamped: float  # below the same white
     below: str  # the reference level
+    frames: int = 1  # whose mean it is the PSNR of
 
     @property
     def line(self) -> str:
         """`38.1 dB below white (2.5 x the mean), clamped there; 35.0 dB unclamped`."""
-        return f"{self.psnr:.1f} dB below {self.below}, clamped there; {self.unclamped:.1f} dB unclamped"
+        of = f", of the mean of {self.frames} frames and of its sharp middle" if self.frames > 1 else ""
+        return f"{self.psnr:.1f} dB below {self.below}, clamped there; {self.unclamped:.1f} dB unclamped{of}"
 
 
 def stated(info: ClipInfo) -> Stated | None:
@@ -156,7 +190,8 @@ def stated(info: ClipInfo) -> Stated | None:
         return None
     by_mean = math.isclose(info.white, WHITE_PER_MEAN * info.mean_radiance, rel_tol=1e-6)
     rule = f"{WHITE_PER_MEAN:g} x the mean" if by_mean else "the 99.9th percentile"
-    return Stated(info.psnr_of_truth, info.psnr_unclamped, f"white ({rule})")
+    planes = 1 if info.render is None or not info.error_per_code else info.render.planes
+    return Stated(info.psnr_of_truth, info.psnr_unclamped, f"white ({rule})", planes)
 
 
 def frame_errors(errors: Callable[[float], float], white: float) -> tuple[tuple[float, float], ...]:

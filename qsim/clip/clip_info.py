@@ -85,6 +85,10 @@ class Work:
     findings: tuple[Finding, ...] = ()
     neighbours: Count = 0  # frames on each side whose samples are carried into a frame (reuse/); 0: each frame alone
     quality: Text = "high"  # of the denoiser: high, balanced or fast
+    planes: Whole = 1  # successive frames, from 0 on, that share the noise of a code (planes.py); 1: each frame alone
+    codes: tuple[Whole, ...] = ()  # frames in a code of each kind, whose middle frames are sharp/; of `planes` > 1
+    sharp_samples: Count = 0  # per pixel, of those sharp frames
+    sharp_quality: str = ""  # of their denoiser; empty: none
 
 
 @dataclass(frozen=True)
@@ -120,8 +124,10 @@ class ErrorInfo:
 
     error_per_frame: tuple[NotNegative, ...] = ()  # rms
     error_at_white_per_frame: tuple[NotNegative, ...] = ()  # the same of pictures clamped at white
+    error_per_code: tuple[NotNegative, ...] = ()  # rms of the mean of frames that share noise, or of its sharp middle
+    error_at_white_per_code: tuple[NotNegative, ...] = ()  # the same of pictures clamped at white
     white: NotNegative | None = None
-    psnr_of_truth: Number | None = None  # dB below white, clamped there; None: not known, or without any error
+    psnr_of_truth: Number | None = None  # dB below white, clamped there, of codes where frames share noise, else frames
     psnr_unclamped: Number | None = None  # dB below white
 
 

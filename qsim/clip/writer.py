@@ -21,6 +21,7 @@ from numpy import ndarray as Array
 from qsim import descriptions, files, locks, records, scratch
 from qsim.arrays import plain
 from qsim.clip import clamped_error, exr
+from qsim.clip.clamped_error import StatedError
 from qsim.clip.clip_info import ClipInfo, FrameFile, frame_file
 from qsim.clip.manifest import OURS, TRUTH, check_replaced, info_of, read_info, target_of
 from qsim.colour import bright_end
@@ -43,6 +44,8 @@ class FrameEntry:
     error: NotNegative | None = None  # rms
     errors_at: tuple[tuple[NotNegative, NotNegative], ...] = ()  # white, and the rms error clamped there
     fireflies: Count | None = None
+    code_error: NotNegative | None = None  # rms, of the code in whose middle the frame is
+    code_errors_at: tuple[tuple[NotNegative, NotNegative], ...] = ()  # as errors_at
 
 
 class ClipWriter:
@@ -101,7 +104,7 @@ class ClipWriter:
         """Return whether an earlier, interrupted writer finished frame t."""
         return self._complete or t in self._frames
 
-    def add(
+    def add(  # noqa: PLR0913 (what a frame may hold)
         self,
         t: int,
         radiance: Array,
@@ -111,13 +114,15 @@ class ClipWriter:
         fireflies: int | None = None,
         errors_at: Sequence[Sequence[float]] = (),
         saturated: Array | None = None,
+        code: StatedError | None = None,
     ) -> None:
         """Store frame t: radiance [H, W] in the clip's unit, and optionally its other images and errors.
 
         `sharp` [H, W] is the radiance at mid-exposure. `truth` may hold flow [2, H, W] and flow_back [2, H, W] in
         pixels, valid [H, W], depth [H, W] in m, body_id [H, W]. `error` is the rms error of the radiance. `errors_at`
         are pairs (white, rms error of radiance and truth clamped there), from which clip.json gets the error at its
-        own white. `fireflies` counts the pixels with implausible samples.
+        own white. `fireflies` counts the pixels with implausible samples. `code` is the error of the code in whose
+        middle the frame is, where frames share the noise of a code.
 
         Images of a clip with `bands` are [3, H, W].
 
@@ -155,6 +160,8 @@ class ClipWriter:
         stored = half.astype(np.float64)
         lost = float(np.sqrt(np.mean((stored - np.minimum(radiance, exr.HALF_MAX)) ** 2)))  # by rounding to halves
         clipped = int(np.count_nonzero(lower))
+        stated = None if error is None else StatedError.of(error, errors_at).and_more(lost)
+        of_code = None if code is None else code.and_more(lost)
         entry = FrameEntry(
             t=t,
             checksums=checksums,
@@ -163,9 +170,11 @@ class ClipWriter:
             largest=float(radiance.max()),
             clipped=clipped,
             saturated=clipped if saturated is not None or mask in contents else None,
-            error=None if error is None else math.hypot(error, lost),
-            errors_at=tuple((float(white), math.hypot(at_white, lost)) for white, at_white in errors_at),
+            error=None if stated is None else stated.plain,
+            errors_at=() if stated is None else stated.at_whites,
             fireflies=None if fireflies is None else int(fireflies),
+            code_error=None if of_code is None else of_code.plain,
+            code_errors_at=() if of_code is None else of_code.at_whites,
         )
         self._frames[t] = entry
         self._complete = False
@@ -314,7 +323,8 @@ class ClipWriter:
         errors = [entry.error for entry in entries if entry.error is not None]
         if len(errors) == frames:
             shares = self.info.render is not None and self.info.render.neighbours > 0
-            found = clamped_error.measured(means, self._high(), errors, [e.errors_at for e in entries], shares)
+            codes = {e.t: StatedError(e.code_error, e.code_errors_at) for e in entries if e.code_error is not None}
+            found = clamped_error.measured(means, self._high(), errors, [e.errors_at for e in entries], shares, codes)
             info = replace(info, **vars(found))
         descriptions.write(self.part / "clip.json", info)
 

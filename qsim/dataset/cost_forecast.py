@@ -24,7 +24,7 @@ from qsim.dataset.recipe import Recipe
 from qsim.dataset.worker_pool import Limits
 from qsim.files import Progress
 from qsim.process import peak_memory
-from qsim.rendering.budget import Budget
+from qsim.rendering.budget import Budget, deciding
 from qsim.rendering.reuse.sharing import Sharing
 from qsim.streams.clip import Clip
 from qsim.streams.sensing import frames_needed
@@ -65,6 +65,8 @@ class Cost:
     sensing: Seconds  # per frame, all streams
     frame_bytes: float  # radiance, ground truth and streams [bytes]
     neighbours: tuple[int, int] = (0, 0)  # frames on each side that share samples, the fewest and the most
+    planes: int = 1  # frames that share the noise of a code
+    limits: tuple[str, ...] = ()  # "40 dB", "7 PPP": which of the two decided the samples of the chosen budgets
 
     @property
     def seconds(self) -> Seconds:
@@ -136,7 +138,19 @@ class Forecast:
 
     def lines(self, machines: int) -> list[str]:
         """Return the forecast as lines of text, for this many equal machines."""
-        header = ("family", "size", "clips", "frames", "samples", "neighbours", "s/clip", "s/frame", "hours", "GB")
+        header = (
+            "family",
+            "size",
+            "clips",
+            "frames",
+            "samples",
+            "limit",
+            "neighbours",
+            "s/clip",
+            "s/frame",
+            "hours",
+            "GB",
+        )
         rows = [
             (
                 cost.family,
@@ -144,6 +158,7 @@ class Forecast:
                 f"{cost.clips}",
                 f"{cost.frames}",
                 "-".join(str(n) for n in sorted(set(cost.samples))),
+                " or ".join(cost.limits),
                 "-".join(str(n) for n in sorted(set(cost.neighbours))),
                 f"{cost.setup.wall:.2f}",
                 f"{cost.per_frame.wall + cost.sensing.wall:.3f}",
@@ -219,10 +234,11 @@ def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
     started = Seconds.now()
     a_code = max((frames_needed(stream, *size, settings.frame_rate) for stream in job.streams), default=1)
     shared = budgets[middle].neighbours
+    planes = budgets[middle].planes
     clip, moments = render_first_frames(
-        job, budgets[middle], folder, min(max(frames, a_code, 2 * shared + 3), settings.frames)
+        job, budgets[middle], folder, min(max(frames, a_code, 2 * shared + 3, 3 * planes), settings.frames)
     )
-    setup, per_frame = setup_and_frame([moment.since(started) for moment in moments], shared)
+    setup, per_frame = setup_and_frame([moment.since(started) for moment in moments], shared, planes)
     setup = Seconds(*map(sum, zip(typical, setup, strict=True)))
     dearer = sum(work) / len(work) / work[middle]
     sensing, codes = sense_streams(job, clip)
@@ -238,15 +254,23 @@ def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
         sensing=sensing,
         frame_bytes=stored + codes,
         neighbours=(min(budget.neighbours for budget in budgets), max(budget.neighbours for budget in budgets)),
+        planes=planes,
+        limits=tuple(sorted({limit for budget in budgets if (limit := deciding(budget.findings))})),
     )
 
 
-def setup_and_frame(moments: list[Seconds], shared: int) -> tuple[Seconds, Seconds]:
+def setup_and_frame(moments: list[Seconds], shared: int, planes: int = 1) -> tuple[Seconds, Seconds]:
     """Return the time of scene and compilation, and that of a further frame, from the time at the end of each frame.
 
     Where frames share samples with `shared` ones on each side, the first frame also traces those after it, and the last
-    ones trace none: a further frame costs what those between them do, if there are two.
+    ones trace none: a further frame costs what those between them do, if there are two. The `planes` of a code are
+    rendered with its first: whole codes are compared.
     """
+    if planes > 1 and len(moments) >= 2 * planes:
+        ends = moments[planes - 1 :: planes]
+        frame = Seconds(*(seconds / (planes * (len(ends) - 1)) for seconds in ends[-1].since(ends[0])))
+        whole = planes * len(ends)
+        return Seconds(*(max(0.0, a - whole * b) for a, b in zip(ends[-1], frame, strict=True))), frame
     usual = moments[shared : len(moments) - shared]
     usual = usual if len(usual) > 1 else moments
     if len(usual) == 1:

@@ -32,6 +32,7 @@ from qsim.streams.storing import sense
 if TYPE_CHECKING:
     from qsim.rendering.budget import Budget
     from qsim.scene import Scene
+    from qsim.streams.sensing import Sensing
 
 RenderJob = Callable[[Job, Path], object]  # renders a job's clip to a path; tests use a quick one
 
@@ -96,8 +97,8 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
     """Choose the budget for the wanted error and for the noise of the stream that collects most electrons per frame.
 
     The noise of frames averages in a code that sums several. What repeats in all of them does not: its limit follows
-    from the stream that collects most electrons per code. Streams in lux or with absolute light do not count: their
-    photons are known only after rendering.
+    from the stream that collects most electrons per code. Where all streams sum frames, these share the noise of a
+    code. Streams in lux or with absolute light set no limit: their photons are known only after rendering.
     """
     from qsim.rendering import fidelity
     from qsim.sensor import devices
@@ -132,9 +133,20 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
         ppp=ppp,
         quantum_efficiency=1.0 if ppp is None else electrons / ppp,
         planes=1.0 if ppp is None else of_code / electrons,
+        codes=[frames_together(sensing) for sensing in job.streams],
         reuse=settings.reuse,
         seed=render_seed(job),
     )
+
+
+def frames_together(sensing: Sensing) -> int:
+    """Return the clip frames whose noise averages in each pixel of each code of a stream, counted from frame 0 on.
+
+    Rows with their own time begin elsewhere, and short exposures see a part of the frames: 1.
+    """
+    if sensing.rows is not None or any(share != 1 for share in sensing.exposures or ()):
+        return 1
+    return sensing.planes
 
 
 def removed(folder: Path) -> str:

@@ -21,9 +21,11 @@ class Budget(Work):
     """The work for one frame, checked; clip.json stores it."""
 
     def __post_init__(self) -> None:
-        for name in ("samples", "bounces", "sub_frames"):
+        for name in ("samples", "bounces", "sub_frames", "planes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"Budget.{name}: at least 1, got {getattr(self, name)!r}")
+        if self.planes > 1 and (self.neighbours or self.sharp_samples < 1):
+            raise ValueError("Budget.planes: frames that share noise have no neighbours, and need sharp_samples")
         if self.neighbours < 0:
             raise ValueError(f"Budget.neighbours: at least 0, got {self.neighbours!r}")
         if self.quality not in DENOISE_COST:
@@ -34,9 +36,26 @@ class Budget(Work):
         """The error by later bounces of clamped pictures, W m^-2 sr^-1; the plain one if no white is known."""
         return self.left_out_at_white if self.white else self.left_out
 
+    @property
+    def of_middles(self) -> Budget:
+        """The work for the sharp frame in the middle of a code."""
+        return replace(
+            self,
+            samples=self.sharp_samples,
+            denoise=bool(self.sharp_quality),
+            quality=self.sharp_quality or "high",
+            planes=1,
+            codes=(),
+        )
+
+    def is_middle(self, t: int) -> bool:
+        """Return whether frame t is in the middle of a code, the later of two, and has a sharp frame."""
+        return self.planes > 1 and any(t % frames == frames // 2 for frames in self.codes)
+
     def grid(self, instants: int) -> int:
         """Return the samples per pixel of each half at each of `instants` instants."""
-        return grid_samples(math.ceil(self.samples / instants / 2))
+        half = math.ceil(self.samples / instants / 2)
+        return plane_grid(half) if self.planes > 1 else grid_samples(half)
 
 
 @dataclass(frozen=True)
@@ -58,6 +77,14 @@ class Allowed:
         return max(errors.at_white / self.target, errors.plain / self.sensor)
 
 
+LIMIT = "limit"  # the finding that names the stricter one, dB or PPP
+
+
+def deciding(findings: Sequence[Finding]) -> str:
+    """Return the limit that decided the samples, as `40 dB` or `7 PPP`; empty if none is stated."""
+    return next((finding.chosen for finding in findings if finding.effect == LIMIT), "")
+
+
 def explain(findings: Sequence[Finding]) -> str:
     """Return one line per finding: effects modelled, effects left out, and their sizes."""
     width = max((len(finding.effect) for finding in findings), default=0)
@@ -74,6 +101,11 @@ def grid_samples(samples: int) -> int:
     while not _is_grid(size):
         size += 1
     return size
+
+
+def plane_grid(samples: int) -> int:
+    """Return the next number of samples of half a plane: 1, 2, 3, and those of `grid_samples`."""
+    return samples if samples < 4 else grid_samples(samples)
 
 
 def _is_grid(size: int) -> bool:

@@ -68,7 +68,8 @@ def render_clip(  # noqa: PLR0913 (settings of a public function)
         for t in range(frames):
             if not writer.has(t):
                 frame = renderer.frame(t)
-                writer.add(t, frame.radiance, frame.sharp, frame.truth, frame.error, frame.fireflies, frame.errors_at)
+                stated = (frame.error, frame.fireflies, frame.errors_at)
+                writer.add(t, frame.radiance, frame.sharp, frame.truth, *stated, code=frame.code)
             if progress is not None:
                 progress(t + 1, frames)
     return Clip.open(path)

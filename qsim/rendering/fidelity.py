@@ -13,8 +13,9 @@ Bounces and blur may each take 30 % of the allowed error (rms); the samples use 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy import ndarray as Array
@@ -25,8 +26,9 @@ from qsim.colour import bright_end, psnr
 from qsim.optics.camera import Camera
 from qsim.optics.diffraction import diffraction_line
 from qsim.optics.radiometry import WHITE_PER_MEAN
-from qsim.rendering.budget import Allowed, Budget, Finding, blur_error, grid_samples
-from qsim.rendering.pilot import COUNTS, Pilot, denoised_samples, rests
+from qsim.rendering.budget import LIMIT, Allowed, Budget, Finding, blur_error, grid_samples, plane_grid
+from qsim.rendering.pilot import COUNTS, OF_PLANES, Pilot, Trials, denoised_samples, rests
+from qsim.rendering.planes import most_planes
 from qsim.rendering.reuse.sharing import Need, Sharing, shared_samples
 from qsim.scene import Scene
 from qsim.scene.bands import Bands
@@ -38,6 +40,7 @@ DEEPEST = 32  # bounces of the reference for them
 MOST_SAMPLES = 16384
 PEAK_INSTANTS = 25  # whose mean gives the white of a blurred frame
 MOST_INSTANTS = 3 + 6 * 85
+PLANES = "planes"  # the finding about frames that share noise
 MOST_TRIED = 15  # instants up to which a larger number is rendered for comparison
 
 
@@ -73,6 +76,7 @@ def choose_budget(  # noqa: PLR0913 (settings of a public function)
     ppp: float | None = None,
     quantum_efficiency: float = 1.0,
     planes: float = 1.0,
+    codes: Sequence[int] = (),
     denoise: bool | None = None,
     reuse: bool | None = None,
     seed: int = 0,
@@ -81,16 +85,23 @@ def choose_budget(  # noqa: PLR0913 (settings of a public function)
 
     `ppp` is the highest light level at which the clip will be sensed; with None, only `psnr` counts. A code that sums
     `planes` frames of `ppp` photons each averages their noise. What repeats from frame to frame has a stricter limit,
-    that of a code: left-out bounces, and all errors of frames that are denoised or share samples. `denoise` None
-    denoises if Open Image Denoise is installed and cheaper at the same measured error. `reuse` None lets neighbouring
-    frames share samples where that is predicted to cost less and the trial costs little against the clip; True tries
-    it at any length, False renders each frame alone. The result depends only on the arguments and the installed
-    software: an interrupted clip resumes with the same budget. `ValueError` for a `psnr` outside 10 to 80 dB, for
-    other values out of range, and for a scene without light.
+    that of a code: left-out bounces, and all errors of frames that are denoised or share samples. `codes` are the
+    frames in a code of each stream that will be sensed from frame 0 on. Sharp frames then share the noise of the code
+    with the fewest (planes.py): `psnr` and `ppp` are asked of its mean light, and the middle of each code gets a sharp
+    frame of the same `psnr`. `denoise` None denoises if Open Image Denoise is installed and cheaper at the same
+    measured error.
+    `reuse` None lets neighbouring frames share samples where that is predicted to cost less and the trial costs little
+    against the clip; True tries it at any length, False renders each frame alone. The result depends only on the
+    arguments and the installed software: an interrupted clip resumes with the same budget. `ValueError` for a `psnr`
+    outside 10 to 80 dB, for other values out of range, and for a scene without light.
     """
     _check_wishes(psnr=psnr, frames=frames, denoise=denoise, reuse=reuse, ppp=ppp, planes=planes)
     if not 0 < quantum_efficiency <= 1:
         raise ValueError(f"quantum_efficiency: expected a number above 0, at most 1, got {quantum_efficiency!r}")
+    summed, why_alone = planes_together(scene, codes, shutter, frames)
+    if summed > 1:  # a code is the picture that has the errors asked for
+        ppp = None if ppp is None else ppp * summed
+        planes = max(1.0, planes / summed)
     pilot = Pilot.of(scene, frame_rate, shutter, frames, seed)
     full = pilot.mean(COUNTS[1], DEEPEST)
     if not full.mean() > 0:
@@ -116,13 +127,15 @@ def choose_budget(  # noqa: PLR0913 (settings of a public function)
     strict = allowed.repeated
     share = math.sqrt(1 - min(strict.fraction(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
     noise = Noise.of(halves, allowed.white).times(pilot.unevenness(instants))
-    found = _shared_or_alone(pilot, _Work(bounces, instants, frames, share, allowed, noise), denoise, reuse)
+    needed = _Work(bounces, instants, frames, share, allowed, noise)
+    found = _shared_or_alone(pilot, needed, denoise, reuse if summed == 1 else False)
     chosen = found.chosen
     dimmed = dimming(full, cut)
     pixels = scene.camera.height * scene.camera.width
     noisy = noise.at(chosen.samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
     findings = (
         limit,
+        deciding_limit(noise, chosen.samples, instants, allowed, psnr, ppp),
         *found.findings,
         about_bounces,
         _light(dimmed, noisy, bool(chosen.denoise)),
@@ -134,7 +147,14 @@ def choose_budget(  # noqa: PLR0913 (settings of a public function)
     )
     work = (chosen.samples, bounces, instants, instants > 1, bool(chosen.denoise))
     errors = (left_out.plain, left_out.at_white, allowed.white, *dimmed)
-    return Budget(*work, *errors, findings, chosen.neighbours, chosen.denoise or "high")
+    budget = Budget(*work, *errors, findings, chosen.neighbours, chosen.denoise or "high")
+    if summed == 1:
+        return _with_finding(budget, Finding(PLANES, "each frame alone", why_alone)) if why_alone else budget
+    shared = _planes(pilot, budget, replace(needed, instants=summed), denoise)
+    if shared is not None:
+        return replace(shared, codes=tuple(sorted(set(codes))))
+    why_alone = f"{summed} sharp frames cost no more than a code of as many planes with its sharp frame"
+    return _with_finding(budget, Finding(PLANES, "each frame alone", why_alone))
 
 
 def _check_wishes(
@@ -152,6 +172,103 @@ def _check_wishes(
         raise ValueError(f"ppp: expected photons per pixel above 0, or None, got {ppp!r}")
     if not 1 <= planes < math.inf:
         raise ValueError(f"planes: expected frames in a code from 1 up, got {planes!r}")
+
+
+def planes_together(scene: Scene, codes: Sequence[int], shutter: float, frames: int) -> tuple[int, str]:
+    """Return how many frames share the noise of a code, 1 if each has its own, and why although codes sum several."""
+    fewest = min(codes, default=1)
+    if fewest < 1:
+        raise ValueError(f"codes: expected frames in a code from 1 up, got {fewest!r}")
+    if max(codes, default=1) == 1:
+        return 1, ""
+    most = most_planes(scene.camera.height * scene.camera.width, 1 if scene.bands is None else 3)
+    reasons = {
+        "the shutter is open": shutter > 0,
+        "a stream has one frame in a code, or codes whose rows or exposures differ": fewest == 1,
+        f"the clip has fewer than {fewest} frames": frames < fewest,
+        f"frames of this size leave memory for {most}, and a code has {fewest}": fewest > most,
+    }
+    why = next((reason for reason, holds in reasons.items() if holds), "")
+    return (1, why) if why else (fewest, "")
+
+
+def _planes(pilot: Pilot, sharp: Budget, work: _Work, denoise: bool | None) -> Budget | None:
+    """Return the budget of `work.instants` planes with the noise of a code; None if it costs as much as sharp ones.
+
+    `sharp` is the budget of a sharp frame with the error asked of a code.
+    """
+    count = work.instants
+    raw = 2 * plane_grid(1)
+    while work.allowed.fraction(_of_code(work.noise, count, raw, sharp.samples)) > work.share and raw < sharp.samples:
+        raw = 2 * plane_grid(raw // 2 + 1)
+    chosen = Sharing(raw * (count - 1) + sharp.samples, 0, "")
+    how = "raw"
+    if denoise is not False:
+        trial = Trials(count, OF_PLANES, partial(_beside_sharp, count, sharp.samples))
+        expected = partial(_of_each, work.noise, count)
+        strict = work.allowed.repeated
+        fewer, _ = denoised_samples(pilot, trial, work.bounces, strict, work.share, chosen.samples, denoise, expected)
+        if fewer is not None:
+            chosen = Sharing(fewer[0], 0, fewer[1])
+            how = f"their mean denoised, {fewer[1]} quality; {raw} without"
+    pixels = pilot.renderer.scene.camera.height * pilot.renderer.scene.camera.width
+    alone = Sharing.of(sharp).cost(pixels)
+    if chosen.cost(pixels) + alone - sharp.samples >= count * alone:
+        return None
+    each = (chosen.samples - sharp.samples) // (count - 1)
+    size = f"{each} samples per pixel each, {how}; that in the middle has {sharp.samples}"
+    budget = replace(
+        sharp,
+        samples=each,
+        denoise=bool(chosen.denoise),
+        quality=chosen.denoise or "high",
+        planes=count,
+        sharp_samples=sharp.samples,
+        sharp_quality=sharp.quality if sharp.denoise else "",
+    )
+    return _with_finding(budget, Finding(PLANES, f"{count} share the noise of a code", size))
+
+
+def _with_finding(budget: Budget, finding: Finding) -> Budget:
+    """Return a budget with a finding after those about errors."""
+    limit = [each.effect for each in budget.findings].index(LIMIT) + 1
+    return replace(budget, findings=(*budget.findings[:limit], finding, *budget.findings[limit:]))
+
+
+def _of_code(noise: Noise, count: int, each: int, in_middle: int) -> Errors:
+    """Return the errors of the mean of `count` planes with so many samples each, and more in the middle one."""
+    others = noise.at(each)
+    middle = noise.at(in_middle)
+    return Errors(
+        math.sqrt((count - 1) * others.at_white**2 + middle.at_white**2) / count,
+        math.sqrt((count - 1) * others.plain**2 + middle.plain**2) / count,
+    )
+
+
+def _beside_sharp(count: int, in_middle: int, each: float) -> int:
+    """Return the samples of a code whose planes have the noise of `each` samples each, if the middle one has more."""
+    left = count / each - 1 / in_middle
+    others = (count - 1) / left if left > 0 else 2.0
+    return (count - 1) * 2 * plane_grid(math.ceil(min(others, in_middle) / 2)) + in_middle
+
+
+def _of_each(noise: Noise, count: int, samples: int) -> Errors:
+    """Return the errors of the mean of `count` instants that have so many samples together."""
+    return noise.at(samples / count, count)
+
+
+def deciding_limit(
+    noise: Noise, samples: int, instants: int, allowed: Allowed, psnr_asked: float, ppp: float | None
+) -> Finding:
+    """Return the finding about the stricter limit, of which the number of samples follows."""
+    found = noise.at(samples / instants, instants)
+    if ppp is None or found.at_white <= 0 or found.at_white / allowed.target >= found.plain / allowed.sensor:
+        size = "the sensor sets no limit" if ppp is None else f"the noise at {ppp:g} photons per pixel allows more"
+        return Finding(LIMIT, f"{psnr_asked:g} dB", size)
+    needed = psnr(allowed.white, allowed.sensor * found.at_white / found.plain)
+    return Finding(
+        LIMIT, f"{ppp:g} PPP", f"1 % of the shot variance needs {needed:.1f} dB, {psnr_asked:g} were asked for"
+    )
 
 
 def _blur(pilot: Pilot, bright: Array, allowed: Allowed, bounces: int) -> tuple[int, float, Finding]:
@@ -192,7 +309,7 @@ def _shared_or_alone(pilot: Pilot, work: _Work, denoise: bool | None, reuse: boo
     if denoise is not False:
         fewer, about_denoiser = denoised_samples(
             pilot,
-            instants,
+            Trials(instants),
             work.bounces,
             strict,
             work.share,

@@ -24,6 +24,7 @@ from qsim.rendering.denoiser import AROUND, available, cleaned_mean
 from qsim.rendering.renderer import Renderer
 from qsim.scene import Scene, Still
 
+OF_PLANES = (4, 8, 16)  # samples of each plane that are tried where their mean is denoised
 COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
 # samples that are tried if COUNTS[0] leave room, and the least by which they raise the error
 FEWEST = 4
@@ -116,8 +117,8 @@ class Pilot:
         return np.mean([self._drawn(t, instant, budget) for instant in self.exposed(t, count)], axis=0)
 
     def exposed(self, t: int, count: int) -> list[float]:
-        """Return `count` instants [s] of the exposure of frame t."""
-        return instants(self.renderer.time(t), self.renderer.shutter / self.renderer.frame_rate, count)
+        """Return `count` instants [s] of the exposure of frame t; without one, those of as many frames around it."""
+        return instants(self.renderer.time(t), (self.renderer.shutter or count) / self.renderer.frame_rate, count)
 
     def unevenness(self, count: int) -> float:
         """Return how much more noise the mean of `count` instants has than under steady light: 1 without flicker.
@@ -186,9 +187,23 @@ def _fastest(scene: Scene, moments: dict[int, float], known: set[int]) -> set[in
     return found
 
 
+@dataclass(frozen=True)
+class Trials:
+    """Which samples of a picture of several instants are tried with the denoiser, and which it can have."""
+
+    instants: int
+    counts: tuple[int, ...] = COUNTS  # of an instant
+    rounded: Callable[[float], int] | None = None  # from those that each instant needs; None: the next grids
+
+    def of_picture(self, needed: float) -> int:
+        """Return the samples of a picture that needs so many."""
+        each = needed / self.instants
+        return self.rounded(each) if self.rounded else 2 * self.instants * grid_samples(math.ceil(each / 2))
+
+
 def denoised_samples(
     pilot: Pilot,
-    count: int,
+    trials_of: Trials,
     bounces: int,
     allowed: Allowed,
     share: float,
@@ -198,18 +213,20 @@ def denoised_samples(
 ) -> tuple[tuple[int, str] | None, Finding]:
     """Return samples and denoiser's quality that reach the error at the least cost, or None if `raw` samples cost less.
 
-    Complete windows of the clip's middle frame are rendered with `count` instants. The error to reach is `share` of the
-    allowed one. `wanted` None denoises only if that costs less. `expected(samples)` are the errors of raw samples; they
-    replace a trial that missed rare paths, which shows as noise far below them.
+    Complete windows of the clip's middle frame are rendered with the instants of a picture. The error to reach is
+    `share` of the allowed one. `wanted` None denoises only if that costs less. `expected(samples)` are the errors of
+    raw samples; they replace a trial that missed rare paths, which shows as noise far below them.
     """
     renderer = pilot.renderer
+    count = trials_of.instants
     t = pilot.middle
     camera = renderer.scene.camera
     reason = _cannot_denoise(renderer, wanted)
     if reason:
         return None, Finding("denoiser", "off", reason)
     cheap = Finding("denoiser", "off", f"{raw} raw samples cost no more")
-    least = {n: DENOISE_COST["fast" if n <= MOST_FASTER * count else "high"] for n in (count * each for each in COUNTS)}
+    numbers = [count * each for each in trials_of.counts]
+    least = {n: DENOISE_COST["fast" if n <= MOST_FASTER * count else "high"] for n in numbers}
     tried = [n for n, cost in least.items() if wanted or n + cost < raw]
     if not tried:
         return None, cheap
@@ -237,11 +254,12 @@ def denoised_samples(
         trials.append(trial(samples))
         if trials[-1]["high"] <= share:
             break
-    if min(trials[0].get(quality, math.inf) for quality in ("balanced", "fast")) * RISE <= share:
+    faster = min(trials[0].get(quality, math.inf) for quality in ("balanced", "fast"))
+    if tried[0] > FEWEST * count and faster * RISE <= share:
         tried, trials = [FEWEST * count, *tried], [trial(FEWEST * count), *trials]
     errors = {quality: [one[quality] for one in trials if quality in one] for quality in DENOISE_COST}
     size = f"tried in {'' if len(parts) == 1 else 'four windows of '}frame {t}"
-    options = _enough(tried, errors, share, count)
+    options = _enough(tried, errors, share, trials_of)
     if wanted and not options:  # asked for: as many samples as there may be
         size = f"{trials[-1]['high']:.2g} times the error allowed with {tried[len(trials) - 1]} samples"
         options = [(2 * count * grid_samples(MOST_DENOISED // 2), "high")]
@@ -267,13 +285,13 @@ def _root_mean(errors: list[float]) -> float:
     return math.sqrt(float(np.mean(np.square(errors))))
 
 
-def _enough(tried: list[int], errors: dict[str, list[float]], share: float, count: int) -> list[tuple[int, str]]:
+def _enough(tried: list[int], errors: dict[str, list[float]], share: float, of: Trials) -> list[tuple[int, str]]:
     """Return samples and quality that reach `share` of the allowed error, by the trials of each quality."""
     found = []
     for quality, fractions in errors.items():
         needed = needed_samples(tried[: len(fractions)], fractions, share)
-        if needed <= (MOST_DENOISED if quality == "high" else MOST_FASTER) * count:
-            found.append((2 * count * grid_samples(math.ceil(needed / count / 2)), quality))
+        if needed <= (MOST_DENOISED if quality == "high" else MOST_FASTER) * of.instants:
+            found.append((of.of_picture(needed), quality))
     return found
 
 

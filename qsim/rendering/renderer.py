@@ -22,7 +22,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.backend import RenderEngine
-from qsim.clip.clamped_error import Errors, error_at, frame_errors, rms, white_in
+from qsim.clip.clamped_error import Errors, StatedError, error_at, frame_errors, rms, white_in
 from qsim.device_lock import one_thread_at_a_time
 from qsim.keys import Key, hash_name, words
 from qsim.optics.radiometry import Crop, check_crop
@@ -32,6 +32,7 @@ from qsim.rendering.camera_rays import CameraRays, Film
 from qsim.rendering.denoiser import cleaned_mean
 from qsim.rendering.engine import activate, in_colour, in_own_variant, select
 from qsim.rendering.mitsuba_scene import Stage, film_pass
+from qsim.rendering.planes import Planes, together
 from qsim.rendering.ray_casting import RayCaster, pixel_rays
 from qsim.rendering.reuse.carrying import Carrier, unshared
 from qsim.rendering.reuse.choice import best_of, reused_mean
@@ -53,12 +54,14 @@ class Frame:
     error: float  # rms error of `radiance` or `sharp`, the larger, W m^-2 sr^-1: noise, blur, the budget's `left_out`
     errors_at: tuple[tuple[float, float], ...]  # (white, the same clamped there), rising; empty without light
     fireflies: int  # pixels whose halves differ by more than FIREFLY rms, or are not finite; those of `sharp` are added
-    sharp: Array | None = None  # as radiance, the instant at mid-exposure, only for an open shutter
+    # as radiance, the instant at mid-exposure, for an open shutter, or with more samples in the middle of a code
+    sharp: Array | None = None
     flow: Array | None = None  # float32 [2, H, W], px, mid-exposure of t to that of t + 1
     flow_back: Array | None = None  # float32 [2, H, W], px, mid-exposure of t to that of t - 1
     valid: Array | None = None  # bool [H, W], the point is seen in frame t + 1
     depth: Array | None = None  # float32 [H, W], m along the optical axis, inf where nothing is
     body_id: Array | None = None  # int32 [H, W], bodies in order, then lamps; -1 where nothing is
+    code: StatedError | None = None  # of a frame in the middle of a code: that of the code or of `sharp`, the larger
 
     @property
     def truth(self) -> dict[str, Array]:
@@ -109,6 +112,10 @@ class Renderer:
         self.stage = Stage(mi, scene)
         self._integrators: dict[int, Any] = {}
         self._caster = RayCaster(self.stage, self.engine.backend)
+        self.frames = frames
+        self._planes: Planes | None = None  # those of the code that was rendered last
+        if self.budget.planes > 1 and shutter > 0:
+            raise ValueError("Budget.planes: frames with an open shutter have their own noise; set it to 1")
         self._whole: Renderer | None = None
         if self.budget.neighbours:
             if reason := unshared(scene, shutter, self.engine.backend):
@@ -149,6 +156,8 @@ class Renderer:
     @in_own_variant
     def frame(self, t: int, *, with_truth: bool = True) -> Frame:
         """Render frame t: arrays of the window's height and width [H, W]."""
+        if self.budget.planes > 1:
+            return self._plane(t, with_truth)
         exposed = self._shared(t, self._whole) if self._whole else self._exposed(self.instants(t), self.key(t))
         radiance, error, errors_at, fireflies = exposed
         sharp = None
@@ -158,12 +167,60 @@ class Renderer:
             fireflies = fireflies + more
             errors_at = tuple((white, max(at, error_at(white, others_at or errors_at))) for white, at in errors_at)
         # Last: it leaves the scene at t + 1, where the next frame starts.
-        return Frame(radiance, error, errors_at, fireflies, sharp, **(self.truth(t) if with_truth else {}))
+        truth: dict[str, Any] = self.truth(t) if with_truth else {}
+        return Frame(radiance, error, errors_at, fireflies, sharp, **truth)
+
+    def _plane(self, t: int, with_truth: bool) -> Frame:
+        """Render a frame that shares the noise of its code with the others."""
+        planes = self._planes_of(t)
+        number = t - planes.first
+        error = planes.errors[number]
+        fireflies = planes.fireflies[number]
+        sharp = None
+        code = None
+        if t in planes.middles:
+            instant = [self.time(t)]
+            found = self._finished(planes.middles[t], instant, self.key(t), self.budget.of_middles)
+            sharp, plain, at_whites, fireflies = found
+            of_sharp = StatedError(plain, at_whites)
+            if number == self.budget.planes // 2 and len(planes.errors) == self.budget.planes:
+                code = planes.error.or_larger(of_sharp)
+            error = error.or_larger(of_sharp)
+        truth: dict[str, Any] = self.truth(t) if with_truth else {}
+        return Frame(planes.light[number], error.plain, error.at_whites, fireflies, sharp, code=code, **truth)
+
+    def _planes_of(self, t: int) -> Planes:
+        """Return the planes of the code that frame t belongs to; the last one is kept."""
+        first = t // self.budget.planes * self.budget.planes
+        if self._planes is None or self._planes.first != first:
+            self._planes = None  # frees its memory
+            stop = first + self.budget.planes
+            self._planes = self._drawn_planes(range(first, stop if self.frames is None else min(stop, self.frames)))
+        return self._planes
+
+    def _drawn_planes(self, frames: range) -> Planes:
+        """Render the planes of a code; those in the middle of codes have more samples."""
+        middles = {}
+        halves = np.empty((len(frames), 2, *(() if self.scene.bands is None else (3,)), *self.shape), np.float32)
+        for plane, s in zip(halves, frames, strict=True):
+            middle = self.budget.is_middle(s)
+            means = self.means([self.time(s)], self.budget.of_middles if middle else self.budget, self.key(s))
+            plane[:] = means[0]
+            if middle:
+                middles[s] = means
+        broken = np.logical_not(np.isfinite(halves).all(axis=1))
+        halves.swapaxes(0, 1)[:, broken] = 0
+        counts = [np.count_nonzero(fireflies_in(halves[i], broken[i])) for i in range(len(frames))]
+        times = [self.time(s) for s in frames]
+        surfaces = self.surfaces(times, self.key(frames.start)) if self.budget.denoise else None
+        light, errors = together(halves, surfaces, self.budget)
+        return Planes(frames.start, light, tuple(errors[:-1]), tuple(map(int, counts)), errors[-1], middles)
 
     def window(self, crop: Crop) -> Renderer:
         """Return a renderer of the same loaded scene for every pixel of another crop."""
         other = copy.copy(self)
         other.film = self.film.window(_checked_crop(self.scene, crop))
+        other._planes = None
         return other
 
     def instants(self, t: int) -> list[float]:
@@ -249,26 +306,29 @@ class Renderer:
 
     def _exposed(self, instants: list[float], key: Key) -> Exposed:
         """Return the mean radiance [H, W], its rms error, that error at some whites, and the fireflies."""
-        means = self.means(instants, self.budget, key)
+        return self._finished(self.means(instants, self.budget, key), instants, key, self.budget)
+
+    def _finished(self, means: Array, instants: list[float], key: Key, budget: Budget) -> Exposed:
+        """Return the same from the means of `means`."""
         halves = means[0]
         broken = ~np.isfinite(means[0]).all(axis=0)
         means[:, :, broken] = 0  # they would break the denoiser and every mean around them
         error = rms((halves[0] - halves[1]) / 2)
         radiance = halves.mean(axis=0)
         fireflies = int(np.count_nonzero(fireflies_in(halves, broken)))
-        white = self.budget.white or white_in(radiance)
+        white = budget.white or white_in(radiance)
         mixed = None
-        if self.budget.denoise:
-            mixed = cleaned_mean(halves, *self.surfaces(instants, key), white, self.budget.quality)
+        if budget.denoise:
+            mixed = cleaned_mean(halves, *self.surfaces(instants, key), white, budget.quality)
             radiance = mixed.picture
             error = mixed.error
 
         def clamped(white: float) -> float:
             noise = mixed.error_at(white) if mixed else Errors.of_halves(halves, white).at_white
             blur = blur_left(np.minimum(means, white), len(instants)) if len(instants) > 1 else 0.0
-            return math.hypot(noise, blur, self.budget.left_out_clamped)
+            return math.hypot(noise, blur, budget.left_out_clamped)
 
-        whole = math.hypot(error, blur_left(means, len(instants)), self.budget.left_out)
+        whole = math.hypot(error, blur_left(means, len(instants)), budget.left_out)
         return radiance.astype(np.float32), whole, frame_errors(clamped, white), fireflies
 
     @in_own_variant

@@ -76,7 +76,7 @@ def unfinished(folders: Iterable[str]) -> list[str]:
 
 def has_sharp(clip: Clip) -> bool:
     """Return whether the clip stores sharp frames beside the exposed ones."""
-    return clip.info.has("sharp", 0)
+    return clip.info.has_sharp
 
 
 def truth(clip: Clip, factor: float, start: int, stop: int) -> Array:

@@ -65,6 +65,10 @@ def test_frames_that_share_samples_are_timed_where_each_traces_one():
     setup, frame = cost_forecast.setup_and_frame(moments[:5], 3)
     assert setup.wall + 5 * frame.wall == pytest.approx(moments[4].wall)
     assert cost_forecast.setup_and_frame([Seconds(4.0, 3.0)], 0) == ((0.0, 0.0), (4.0, 3.0))
+    codes = [Seconds(*(end,) * 2) for end in (9.0, 9.5, 10.0, 14.0, 14.5, 15.0, 19.0)]
+    setup, frame = cost_forecast.setup_and_frame(codes, 0, 3)  # 5 s per code of three planes
+    assert frame == pytest.approx((5 / 3, 5 / 3))
+    assert setup == pytest.approx((5.0, 5.0))
 
 
 def test_a_few_jobs_are_looked_at_from_first_to_last():

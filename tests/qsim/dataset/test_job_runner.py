@@ -130,7 +130,8 @@ def failing(name: str, step: int, number: int, monkeypatch: pytest.MonkeyPatch):
 def test_the_budget_hides_behind_the_noise_of_a_clip_frame(monkeypatch):
     """A code of 7 planes or 12 slices averages the noise of its frames, so each frame has a share of its photons.
 
-    What repeats in all frames of a code is compared with the electrons of the code.
+    What repeats in all frames of a code is compared with the electrons of the code. Frames share the noise of a code
+    unless its rows begin elsewhere, or it sees a part of them.
     """
     from qsim.rendering import fidelity
 
@@ -140,15 +141,18 @@ def test_the_budget_hides_behind_the_noise_of_a_clip_frame(monkeypatch):
     summed = '[[streams]]\nsensor = "spad512s"\nbits = 3\ngroup = true\nppp = 14.0\n'
     sliced = '[[streams]]\nsensor = "quiver-physical"\nbits = 3\nslices = 12\nppp = 36.0\n'
     single = '[[streams]]\nsensor = "quiver-physical"\nbits = 3\nppp = 9.0\n'
-    for streams, ppp, efficiency, planes in (
-        (single, 9.0, 0.8, 1),
-        (summed, 2.0, 0.5, 7),
-        (sliced, 3.0, 0.8, 12),
-        (summed + sliced, 3.0, 0.8, 12),
-        (single + sliced, 9.0, 0.8, 4),  # 28.8 electrons per code, 7.2 per frame
+    for streams, ppp, efficiency, planes, codes in (
+        (single, 9.0, 0.8, 1, [1]),
+        (summed, 2.0, 0.5, 7, [7]),
+        (summed + "row_delay = 1e-6", 2.0, 0.5, 7, [1]),
+        (sliced, 3.0, 0.8, 12, [12]),
+        (sliced + "exposures = [1.0, 0.25]", 3.0, 0.8, 12, [1]),
+        (summed + sliced, 3.0, 0.8, 12, [7, 12]),
+        (single + sliced, 9.0, 0.8, 4, [1, 12]),  # 28.8 electrons per code, 7.2 per frame
     ):
         (job,) = recipe.parse(head + streams).jobs
         job_runner.choose_budget(job, job_runner.load_scene(job))
         assert asked[-1]["ppp"] == pytest.approx(ppp)
         assert asked[-1]["quantum_efficiency"] == pytest.approx(efficiency)
         assert asked[-1]["planes"] == pytest.approx(planes)
+        assert asked[-1]["codes"] == codes

@@ -59,7 +59,9 @@ def test_a_denoised_trial_with_far_less_noise_than_the_pilots_is_rejected():
     loaded = pilot.Pilot.of(made, 2000.0, 0.0, 1, 0)
     allowed = Allowed(white=10.0, target=0.02)
     lucky, plain = (
-        pilot.denoised_samples(loaded, 1, 2, allowed, 1.0, 5000, None, lambda n, noise=noise: Errors(noise, noise))[0]
+        pilot.denoised_samples(
+            loaded, pilot.Trials(1), 2, allowed, 1.0, 5000, None, lambda n, noise=noise: Errors(noise, noise)
+        )[0]
         for noise in (100.0, 0.0)
     )
     assert lucky is None
@@ -95,7 +97,7 @@ def test_the_cheapest_quality_of_the_denoiser_that_reaches_the_error_is_chosen(m
     made = plate(None, camera=replace(CAMERA, height=48, width=64))
     loaded = pilot.Pilot(Renderer(made), np.zeros((1, 48, 64)), 0, (0,))
     found, about = pilot.denoised_samples(
-        loaded, 1, 2, Allowed(10.0, 1.0), 1.0, 300, None, lambda samples: Errors(0.0, 0.0)
+        loaded, pilot.Trials(1), 2, Allowed(10.0, 1.0), 1.0, 300, None, lambda samples: Errors(0.0, 0.0)
     )
     assert found == chosen
     assert (f"{chosen[1]} quality" if chosen else "off") in about.chosen
