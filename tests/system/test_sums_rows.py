@@ -1,4 +1,4 @@
-"""The program of rows about codes that sum planes: errors without that of the reference, and rows that are made once."""
+"""The rows about codes that sum planes: errors without those of the reference, and a page that compares costs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_the_noise_of_the_reference_is_not_in_an_error():
     reference = truth + 0.3 * rng.standard_normal((2, *truth.shape))
     found = sums_rows.squared_error(light, reference, math.inf)
     assert found == pytest.approx(0.01, abs=critical_z() * 0.1 / math.sqrt(truth.size))
-    assert sums_rows.squared_error(truth, reference, 0.0) == 0
+    assert sums_rows.squared_error(truth, reference, -9.0) == 0
     assert sums_rows.decibels(2.0, 4e-4) == pytest.approx(40)
     assert sums_rows.decibels(2.0, -1.0) == pytest.approx(80)
 
