@@ -37,6 +37,7 @@ def setting(  # noqa: PLR0913 (settings of a public function)
     option: str = "",
     short: str = "",
     shown: str = "",
+    example: Any = None,
     varied: bool = False,
     recipe: bool = True,
     positional: bool = False,
@@ -50,8 +51,8 @@ def setting(  # noqa: PLR0913 (settings of a public function)
 
     `words` are one line of help without its default. `unit` is that of the value. `unset` says what None means.
     `option` is the name on the command line where it is not the field's, `short` its letter, and `shown` what stands
-    for its value. A `varied` setting may be a list on the command line and in a recipe: one result per value. `recipe`
-    is False if recipes have no such key.
+    for its value. `example` is a value for a reader of the manual, where the default is none. A `varied` setting may be
+    a list on the command line and in a recipe: one result per value. `recipe` is False if recipes have no such key.
 
     The rest is of command lines. A `positional` setting has no option. A list is given with commas, or as `several`
     words that follow its option, or by a `repeated` option. `read` makes a value of a word that its type does not
@@ -59,7 +60,7 @@ def setting(  # noqa: PLR0913 (settings of a public function)
     others that the setting takes. `section` is a heading of the help.
     """
     extra: dict[str, Any] = {"unit": unit, "unset": unset, "option": option, "short": short, "shown": shown}
-    extra |= {"varied": varied, "recipe": recipe, "positional": positional, "several": several}
+    extra |= {"example": example, "varied": varied, "recipe": recipe, "positional": positional, "several": several}
     extra |= {"read": read, "choices": tuple(choices), "known": known, "section": section}
     return Meta(description=words, extra=extra)
 
@@ -77,6 +78,7 @@ class Setting:
     option: str  # name of the option, without dashes
     short: str
     shown: str
+    example: Any
     varied: bool
     recipe: bool
     meta: Meta  # the declaration

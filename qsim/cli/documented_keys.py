@@ -1,7 +1,8 @@
 """Lists the keys of recipes and sensor files: what each accepts, an example, and its meaning.
 
-Keys and what they accept come from the records that the files are read into. Examples and
-meanings come from the commented file in the docstring of the module that reads it, or from the comments of the fields.
+Keys and what they accept come from the records that the files are read into. Those of a recipe are settings, which
+declare meanings and examples. Those of a sensor file come from the commented file in the docstring of the module that
+reads it, or from the comments of the fields.
 """
 
 from __future__ import annotations
@@ -9,40 +10,38 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import json
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from importlib import import_module
 from typing import Any, NamedTuple
 
 from qsim import records
-from qsim.settings import settings_of
+from qsim.dataset import recipe_file
+from qsim.rendering.render_settings import RenderSettings
+from qsim.settings import Setting, settings_of
+from qsim.streams.sensing import Sensing
 from qsim.tables import text_table
 
 
 class Section(NamedTuple):
-    """The modules that declare a section of a file."""
+    """Where the keys of a section of a sensor file are described."""
 
-    commented_in: str  # its docstring shows the section as a commented file
+    commented_in: str  # a module whose docstring shows the section as a commented file
     checked_in: str = ""
     name: str = ""  # of the record; "": none, the commented lines are the keys
 
 
-_RECIPE = "qsim.dataset.recipe"
-_RECORDS = "qsim.dataset.recipe_file"
 _DEFECTS = "qsim.sensor.defects.defect_table"
-RECIPE = {
-    "[recipe]": Section(_RECIPE, _RECORDS, "Head"),
-    "[[scenes]]": Section(_RECIPE, _RECORDS, "ScenesSection"),
-    "[[streams]]": Section(_RECIPE, _RECORDS, "StreamsSection"),
-}
 SENSOR_FILE = {
-    "[sensor]": Section("qsim.sensor.file_laws"),
+    "[sensor]": Section("qsim.sensor.file_laws", "qsim.sensor.file_laws", "Laws"),
     "[sources]": Section("qsim.sensor.file_laws"),
     "[defects]": Section(_DEFECTS, _DEFECTS, "DefectKeys"),
     "[colour]": Section("qsim.sensor.colour_filter"),
 }
-SECTIONS = RECIPE | SENSOR_FILE
+RECIPE = tuple(recipe_file.SECTIONS)
 
 
 class Key(NamedTuple):
@@ -59,18 +58,49 @@ class Key(NamedTuple):
 
 
 def keys(section: str) -> list[Key]:
-    """Return the keys of a section, in the order of its checks; `ValueError` where Python removed the docstrings."""
-    where = SECTIONS[section]
+    """Return the keys of a section of a recipe or of a sensor file."""
+    return recipe_keys(section) if section in RECIPE else sensor_keys(section)
+
+
+def recipe_keys(section: str) -> list[Key]:
+    """Return the keys of a section of a recipe, in the order of its record: what their settings declare."""
+    shared = {one.name: one for kind in (RenderSettings, Sensing) for one in settings_of(kind)}
+    inherited = {"seed", *(one.name for one in settings_of(RenderSettings))} if section != RECIPE[0] else set()
+    found = []
+    for one in settings_of(recipe_file.SECTIONS[section]):
+        default = one.default_words or shared.get(one.name, one).default_words
+        if one.name in inherited:
+            default = f"that of {RECIPE[0]}"
+        if section == RECIPE[2] and one.name in recipe_file.StreamsKeys.LIGHT:
+            default = f"none; one of {', '.join(recipe_file.StreamsKeys.LIGHT)} is needed"
+        told = replace(one, unset="" if one.required else default)
+        example = _example(replace(one, default=shared.get(one.name, one).default))
+        found.append(Key(one.name, one.required, one.expected, json.dumps(example), told.help_with_default))
+    return found
+
+
+def _example(one: Setting) -> Any:
+    """Return an example of a setting: what it states, else another than its default."""
+    if one.example is not None:
+        return one.example
+    if any(records.bare_type(member) is bool for member in records.members_of(one.hint)):
+        return one.default is not True
+    return one.choices[0] if one.choices else one.default
+
+
+def sensor_keys(section: str) -> list[Key]:
+    """Return the keys of a section of a sensor file; `ValueError` where Python removed the docstrings."""
+    where = SENSOR_FILE[section]
     text = import_module(where.commented_in).__doc__
     if text is None:
         raise ValueError("the keys are described in docstrings, which python -OO removes; run without -OO")
     examples = commented(text, section)
     if not where.name:
         return [Key(name, False, "", *found) for name, found in examples.items()]
-    if section in RECIPE:
-        examples = commented(text, "[recipe]") | examples  # [[scenes]] may repeat keys of [recipe]
     record = getattr(import_module(where.checked_in), where.name)
-    return [Key(name, needed, accepts, *examples[name]) for name, needed, accepts in flat(record)]
+    found = [Key(name, needed, accepts, *examples[name]) for name, needed, accepts in flat(record)]
+    known = {"model", *(key.name for key in found)}
+    return found + [Key(name, False, "", *more) for name, more in examples.items() if name not in known]  # by others
 
 
 def flat(record: Any, above: str = "") -> Iterator[tuple[str, bool, str]]:
@@ -165,7 +195,7 @@ def of_sensor_files() -> dict[str, list[Key]]:
 
     models = {f"[sensor] of a {model}": model_keys(model) for model in MODELS}
     shared = {section: keys(section) for section in SENSOR_FILE}
-    laws = [key for key in shared.pop("[sensor]") if key.name != "model"]
+    laws = shared.pop("[sensor]")
     return models | {"[sensor] of any model, laws": laws} | shared
 
 

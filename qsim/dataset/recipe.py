@@ -1,46 +1,23 @@
 """Reads a recipe, one TOML file, into the jobs of a data set; errors name file and place, as in `scenes[0].seeds[1]`.
 
     [recipe]
-    name = "starter"           # of the data set: letters, digits, '.', '_', '-'
-    seed = 0                   # of the samples and of the noise; default 0
-    frames = 21                # per clip
-    height = 128               # pixels
-    width = 128                # pixels
-    frame_rate = 2000.0        # frames per second of the scene's time; default 2000
-    shutter = 0.0              # open share of a frame; 0, the default: a sharp instant with the light of a full frame
-    psnr = 40.0                # wanted error of the radiance, dB below white, clamped there; default 40
-    bands = "rgb"              # colour: bands R, G and B; default: one band
-    camera_path = "path.json"  # poses, view and distortion of the camera, a transforms.json; default: the scene's
-    reuse = true               # sharp frames share samples with neighbours where that costs less; false: each alone;
-                               # default: where a trial costs little against the clip
+    name = "starter"
+    frames = 21
+    height = 128
+    width = 128
 
     [[scenes]]                 # one clip per family, seed and speed
-    family = "fan"             # a family of scenes/; or a .py, .xml, .glb file or folder beside the recipe ("./things")
-    seeds = [0, 1, 2]          # one clip each; or give count
-    count = 3                  # clips of the seeds first ... first + count - 1
-    first = 0                  # first seed of a count; default 0
-    speed = [1.0, 2.0]         # factor on all motions, a number or a list; default 1
-    split = "train"            # train, the default, val or test
-    # frames, height, width, frame_rate, shutter, psnr, bands, camera_path, reuse: as above, for these scenes only
+    family = "fan"
+    seeds = [0, 1, 2]
+    split = "train"
 
     [[streams]]                # optional; one stream per bits and light level, in every clip
-    sensor = "quiver-physical" # a name of `qsim doctor --devices`, or a .toml file beside the recipe
-    bits = [1, 3]              # of a code, a number or a list; default: the sensor's own
-    ppp = [3.25, 26.0]         # photons per pixel and code, mean of the clip, a number or a list; or lux, or absolute
-    lux = 1.3                  # faceplate lux at 555 nm instead of ppp, a number or a list
-    absolute = true            # the light of the scene as it is, instead of ppp
-    seed = 1                   # of the noise; default: that of [recipe]
-    name = "dim"               # of the stream; default: made from sensor, bits and light
-    group = true               # a code sums 2^bits - 1 clip frames as binary planes; default false
-    follow = true              # a counting SPAD is drawn photon by photon, so that their times are known; default false
-    slices = 16                # clip frames in one exposure of a QIS or a counting SPAD; default 1
-    diffraction = true         # blur by the lens's Airy pattern; default false
-    row_delay = 2e-6           # seconds from one row, or column, to the next; default: all at once
-    row_order = "down"         # order of rows: down, the default, or up; of columns: right or left
-    exposures = [1.0, 0.25]    # shares of a code's time with light, in turn; default: all of it
-    light_drift = 0.2          # rise of the light from the first code to the last, as a share; default 0
-    colour = "rggb"            # colour filters: rggb, quad, rgbw or a .toml with [colour]; default: the sensor's
-    temperature = 25.0         # degrees C, by a law of the sensor file (dark_doubling); default: that of the file
+    sensor = "quiver-physical"
+    bits = [1, 3]
+    ppp = [3.25, 26.0]
+
+The keys are declared in recipe_file.py; `qsim recipes --keys` lists them. Keys of [recipe] may stand in [[scenes]], for
+these scenes alone.
 
 A (family, seed) belongs to one split at every speed, and a family of the test split to no other split.
 """
@@ -57,7 +34,7 @@ from qsim import checks, files, records
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.clip_info import ClipInfo
 from qsim.dataset.job import Job
-from qsim.dataset.recipe_file import Head, RecipeFile, ScenesSection, StreamsSection
+from qsim.dataset.recipe_file import Head, RecipeFile, ScenesSection, StreamsKeys, StreamsSection
 from qsim.optics.radiometry import RGB
 from qsim.parsing import parse_toml
 from qsim.rendering.render_settings import RenderSettings
@@ -284,7 +261,7 @@ def _streams_of(source: RecipeFile, seed: int, path: Path) -> dict[Sensing, str]
 
 def _sensings_of(section: StreamsSection, seed: int, beside: Path) -> list[Sensing]:
     """Return one stream per bits and light level of a section; `ValueError` if sensor or filters cannot be read."""
-    units = [unit for unit in ("ppp", "lux", "absolute") if getattr(section, unit) is not None]
+    units = [unit for unit in StreamsKeys.LIGHT if getattr(section, unit) is not None]
     if len(units) != 1:
         wanted = "give one light level, ppp = ..., lux = ... or absolute = true"
         raise ValueError(f"{wanted}; {' and '.join(units) or 'none'} given")

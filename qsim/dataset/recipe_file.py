@@ -8,7 +8,7 @@ The settings of a clip are those of `RenderSettings`, and the settings of a stre
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from msgspec import Meta
 
@@ -25,19 +25,23 @@ Speeds = Speed | Annotated[tuple[Speed, ...], Meta(min_length=1)]
 class HeadKeys:
     """The section [recipe]: name and seed of the data set, and the settings of all its clips."""
 
-    name: Annotated[Name, setting("of the data set: letters, digits, '.', '_', '-'")]
-    seed: Annotated[Seed | None, setting("of the samples and of the noise", unset="0")] = None
+    name: Annotated[Name, setting("of the data set: letters, digits, '.', '_', '-'", example="starter")]
+    seed: Annotated[Seed | None, setting("of the samples and of the noise", unset="0", example=1)] = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScenesKeys:
     """A section [[scenes]]: one clip per seed and speed of a family."""
 
-    family: Annotated[Text, setting('a family of scenes/; or a .py, .xml, .glb file or folder beside it ("./things")')]
-    seeds: Annotated[Seeds | None, setting("one clip each; or give count")] = None
-    count: Annotated[Frames | None, setting("clips of the seeds first ... first + count - 1", unset="1")] = None
-    first: Annotated[Seed | None, setting("first seed of a count", unset="0")] = None
-    speed: Annotated[Speeds, setting("factor on all motions, a number or a list")] = 1.0
+    family: Annotated[
+        Text, setting('a family of scenes/; or a .py, .xml, .glb file or folder beside it ("./things")', example="fan")
+    ]
+    seeds: Annotated[Seeds | None, setting("one clip each; or give count", example=[0, 1, 2])] = None
+    count: Annotated[Frames | None, setting("clips of the seeds first ... first + count - 1", unset="1", example=3)] = (
+        None
+    )
+    first: Annotated[Seed | None, setting("first seed of a count", unset="0", example=100)] = None
+    speed: Annotated[Speeds, setting("factor on all motions, a number or a list", example=[1.0, 2.0])] = 1.0
     split: Annotated[Split, setting("split of the data set")] = "train"
 
 
@@ -45,7 +49,11 @@ class ScenesKeys:
 class StreamsKeys:
     """A section [[streams]]: one stream per bits and light level, in every clip."""
 
-    absolute: Annotated[Literal[True] | None, setting("the light of the scene as it is, instead of ppp")] = None
+    LIGHT: ClassVar[tuple[str, ...]] = ("ppp", "lux", "absolute")  # one of them is needed
+
+    absolute: Annotated[
+        Literal[True] | None, setting("the light of the scene as it is, instead of ppp", example=True)
+    ] = None
 
 
 if TYPE_CHECKING:

@@ -26,17 +26,27 @@ class Sensing:
     `ValueError` for values out of their bounds, and for settings that exclude each other.
     """
 
-    sensor: Annotated[Text | Sensor, setting("a name of `qsim sensors`, or a .toml file", known=devices.DEVICES.keys)]
-    bits: Annotated[Bits | None, setting("bits per code", unset="the sensor's own", varied=True)] = None
+    sensor: Annotated[
+        Text | Sensor,
+        setting("a name of `qsim sensors`, or a .toml file", known=devices.DEVICES.keys, example="quiver-physical"),
+    ]
+    bits: Annotated[Bits | None, setting("bits per code", unset="the sensor's own", varied=True, example=[1, 3])] = None
     ppp: Annotated[
         Light | None,
-        setting("mean photons per pixel and code over the clip", unset="the clip's own light", varied=True),
+        setting(
+            "mean photons per pixel and code over the clip",
+            unset="the clip's own light",
+            varied=True,
+            example=[3.25, 26.0],
+        ),
     ] = None
-    lux: Annotated[Light | None, setting("faceplate lux at 555 nm, instead of ppp", unit="lx", varied=True)] = None
-    seed: Annotated[Seed, setting("seed of the noise")] = 0
-    name: Annotated[Name | None, setting("name of the stream", unset="made from sensor, bits and light", short="o")] = (
-        None
-    )
+    lux: Annotated[
+        Light | None, setting("faceplate lux at 555 nm, instead of ppp", unit="lx", varied=True, example=1.3)
+    ] = None
+    seed: Annotated[Seed, setting("seed of the noise", example=1)] = 0
+    name: Annotated[
+        Name | None, setting("name of the stream", unset="made from sensor, bits and light", short="o", example="dim")
+    ] = None
     group: Annotated[bool, setting("sum 2^bits - 1 clip frames, as binary planes, to one code")] = False
     diffraction: Annotated[bool, setting("blur light with the lens's Airy pattern")] = False
     defects: Annotated[
@@ -51,13 +61,18 @@ class Sensing:
     ] = None
     slices: Annotated[
         Frames,
-        setting("counting SPAD or QIS: clip frames per exposure, so that light may change within it (motion blur)"),
+        setting(
+            "counting SPAD or QIS: clip frames per exposure, so that light may change within it (motion blur)",
+            example=16,
+        ),
     ] = 1
     row_delay: Annotated[
-        Positive | None, setting("seconds from one row, or column, to the next", unit="s", unset="all at once")
+        Positive | None,
+        setting("seconds from one row, or column, to the next", unit="s", unset="all at once", example=2e-06),
     ] = None
     row_order: Annotated[
-        RowOrder | None, setting("direction of rows (down or up), or of columns (right or left)", unset="down")
+        RowOrder | None,
+        setting("direction of rows (down or up), or of columns (right or left)", unset="down", example="down"),
     ] = None
     colour: Annotated[
         Text | ColourFilter | None,
@@ -65,6 +80,7 @@ class Sensing:
             "colour filters: rggb, quad, rgbw, red, green, blue, or a .toml with a table [colour]",
             unset="those of the sensor's own .toml file",
             shown="MASK",
+            example="rggb",
         ),
     ] = None
     exposures: Annotated[
@@ -72,15 +88,19 @@ class Sensing:
         setting(
             "shares of a code's time with light, in turn, as in 1,0.25,0.0625; light levels are of full exposures",
             unset="all of it",
+            example=[1.0, 0.25],
         ),
     ] = None
     light_drift: Annotated[
-        Rise, setting("rise of the light from the first code to the last, as a share: a lamp that warms up")
+        Rise,
+        setting("rise of the light from the first code to the last, as a share: a lamp that warms up", example=0.2),
     ] = 0.0
     follow: Annotated[bool, setting("counting SPAD: draw photon by photon, so that their times are known")] = False
     temperature: Annotated[
         Number | None,
-        setting("degrees C of a sensor file with dark_doubling", unit="degrees C", unset="the file's own"),
+        setting(
+            "degrees C of a sensor file with dark_doubling", unit="degrees C", unset="the file's own", example=25.0
+        ),
     ] = None
     pixel_pitch: Annotated[
         Positive | None,

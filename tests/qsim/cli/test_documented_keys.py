@@ -8,7 +8,7 @@ import pytest
 from qsim import records
 from qsim.cli import documented_keys
 from qsim.cli.program import main
-from qsim.dataset import recipe, recipe_file
+from qsim.dataset import recipe_file
 from qsim.sensor import devices, file_laws
 from qsim.sensor.defects import defect_table
 
@@ -26,7 +26,9 @@ def test_every_key_of_a_recipe_is_printed(capsys):
     for section, record in recipe_file.SECTIONS.items():
         assert set(found[section]) == set(records.hints_of(record))
         assert all(row["meaning"] and row["accepts"] for row in found[section].values())
-    assert found["[recipe]"]["reuse"]["meaning"].endswith("default: where a trial costs little against the clip")
+    assert found["[recipe]"]["reuse"]["meaning"].endswith("(default: where a trial costs little against the clip)")
+    assert found["[[scenes]]"]["psnr"]["meaning"].endswith("(default: that of [recipe])")
+    assert found["[[streams]]"]["seed"]["meaning"].endswith("(default: that of [recipe])")
 
 
 def test_every_key_of_a_sensor_file_is_printed(capsys):
@@ -51,8 +53,8 @@ def test_a_meaning_ends_where_its_comment_ends():
 
 
 def test_without_docstrings_the_reason_is_named(monkeypatch, capsys):
-    monkeypatch.setattr(recipe, "__doc__", None)
-    assert main(["recipes", "--keys"]) == 2
+    monkeypatch.setattr(file_laws, "__doc__", None)
+    assert main(["sensors", "--keys"]) == 2
     assert "run without -OO" in capsys.readouterr().err
 
 
