@@ -31,9 +31,12 @@ print({name: tuple(value.shape) for name, value in batch.items() if torch.is_ten
 
 torch.manual_seed(0)
 network = torch.nn.Sequential(
-    torch.nn.Conv2d(5, 16, 3, padding=1), torch.nn.GELU(), torch.nn.Conv2d(16, 16, 3, padding=1), torch.nn.GELU(),
+    torch.nn.Conv2d(5, 16, 3, padding=1),
+    torch.nn.GELU(),
+    torch.nn.Conv2d(16, 16, 3, padding=1),
+    torch.nn.GELU(),
     torch.nn.Conv2d(16, 1, 3, padding=1),
-)  # fmt: skip
+)
 optimiser = torch.optim.Adam(network.parameters(), 3e-3)
 losses = []
 for batch in loader:

@@ -106,10 +106,14 @@ def notebook(name: str) -> dict[str, Any]:
             found = results[number] if number < len(results) else Output("", [])
             made.append(
                 {
-                    "cell_type": "code", "id": f"code-{number}", "metadata": {}, "execution_count": None,
-                    "source": shown(cell.code), "outputs": _results(found),
+                    "cell_type": "code",
+                    "id": f"code-{number}",
+                    "metadata": {},
+                    "execution_count": None,
+                    "source": shown(cell.code),
+                    "outputs": _results(found),
                 }
-            )  # fmt: skip
+            )
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     return {"cells": made, "metadata": {"kernelspec": kernel}, "nbformat": 4, "nbformat_minor": 5}
 

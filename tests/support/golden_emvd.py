@@ -62,9 +62,15 @@ def run(network: EMVD, codes: np.ndarray) -> tuple[Tensor, Tensor]:
 def recorded(network: EMVD, codes: np.ndarray) -> dict[str, Tensor]:
     """All stages of a run; `_t2` are those of frame 2, where there is one."""
     calls = Recorder(
-        {"bands": network.ft, "image": network.fti, "2": network.vd, "1": network.md1, "0": network.md0,
-         "omega": network.refine}
-    )  # fmt: skip
+        {
+            "bands": network.ft,
+            "image": network.fti,
+            "2": network.vd,
+            "1": network.md1,
+            "0": network.md0,
+            "omega": network.refine,
+        }
+    )
     output, states = run(network, codes)
     result = {"output": output, "state": states}
     if codes.shape[1] < 3:

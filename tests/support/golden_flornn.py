@@ -54,9 +54,9 @@ def inputs(
 ) -> tuple[Tensor, Tensor, Flows]:
     """Images [B, N, C, H, W], noise maps [B, N, 1, H, W] and flows for the first outputs; None: all that have flows."""
     codes, noise, forward, backward = (
-        torch.from_numpy(np.asarray(arrays[key], np.float64)) for key in ("codes", "noise_map", "flow_forward",
-                                                                           "flow_backward")
-    )  # fmt: skip
+        torch.from_numpy(np.asarray(arrays[key], np.float64))
+        for key in ("codes", "noise_map", "flow_forward", "flow_backward")
+    )
     for key, array, channels in (("flow_forward", forward, 2), ("flow_backward", backward, 2), ("noise_map", noise, 1)):
         wanted = (len(codes), channels, *codes.shape[-2:])
         if array.ndim != 5 or (len(array), *array.shape[2:]) != wanted or (key != "flow_backward" and not array.size):

@@ -52,9 +52,14 @@ def remember_as_in_training(network: MemDeblur) -> None:
 def recorded(network: MemDeblur, frames: Tensor) -> dict[str, Tensor]:
     """All stages of a run on frames [B, T, 1, H, W], as far as the clip has their frames."""
     calls = Recorder(
-        {"down": network.downsampling, "key": network.memory.key_proj["key_proj"], "read": network.memory.attention,
-         "backward": network.backward_resblocks, "hidden": network.forward_resblocks["main"]}
-    )  # fmt: skip
+        {
+            "down": network.downsampling,
+            "key": network.memory.key_proj["key_proj"],
+            "read": network.memory.attention,
+            "backward": network.backward_resblocks,
+            "hidden": network.forward_resblocks["main"],
+        }
+    )
     outputs = network.scales(network.images(frames))
     count = frames.shape[1]
     result = {

@@ -44,10 +44,19 @@ def recorded(network: RVRT, frames: Tensor) -> dict[str, Tensor]:
     align = network.deform_align["backward_1"]
     last = network.deform_align["forward_2"]
     calls = Recorder(
-        {"flow": network.spynet, "ln": main["3"], "layer0": layers[0], "layer1": layers[1], "block0": main["5"][0],
-         "stack": network.backbone["backward_1"], "raw": align.conv_offset, "align": align, "last": last,
-         "reconstruction": network.reconstruction}
-    )  # fmt: skip
+        {
+            "flow": network.spynet,
+            "ln": main["3"],
+            "layer0": layers[0],
+            "layer1": layers[1],
+            "block0": main["5"][0],
+            "stack": network.backbone["backward_1"],
+            "raw": align.conv_offset,
+            "align": align,
+            "last": last,
+            "reconstruction": network.reconstruction,
+        }
+    )
     seen: list[Tensor] = []
     hook = align.conv_offset.register_forward_pre_hook(lambda _module, inputs: seen.append(inputs[0]))
     features = network.features(frames)

@@ -37,11 +37,19 @@ def recorded(network: Spk2ImgNet, frames: Tensor) -> dict[str, Tensor]:
     """All stages of a window [B, 10, H, W]; features are cut to every n-th channel, as in the file."""
     align = network.pcd_align["pcd_align"]
     calls = Recorder(
-        {"groups": network.extractor, "weights": network.extractor["ca"], "aligned": align, "gate0": network.mask0,
-         "gate4": network.mask4, "fusion1": network.rec_conv0, "fusion2": network.rec_conv1,
-         "offset3": align["L3_dcnpack_1"].conv_offset_mask, "cascade": align["cas_dcnpack"].conv_offset_mask}
+        {
+            "groups": network.extractor,
+            "weights": network.extractor["ca"],
+            "aligned": align,
+            "gate0": network.mask0,
+            "gate4": network.mask4,
+            "fusion1": network.rec_conv0,
+            "fusion2": network.rec_conv1,
+            "offset3": align["L3_dcnpack_1"].conv_offset_mask,
+            "cascade": align["cas_dcnpack"].conv_offset_mask,
+        }
         | {f"dcn{level}": align[f"L{level}_dcnpack_1"] for level in (1, 2, 3)}
-    )  # fmt: skip
+    )
     output, estimates = network.window(frames)
     return {
         "output": output,

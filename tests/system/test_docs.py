@@ -158,8 +158,13 @@ def _calibration(folder: Path) -> None:
         electrons = rng.poisson(light + 20 * exposure, (20, 40, 40)) + 0.25 * rng.standard_normal((20, 40, 40))
         return np.clip(np.rint(8 * electrons + 40), 0, 255).astype(np.uint8)
 
-    for name, light, exposure in (("dark_1ms", 0, 1e-3), ("dark_50ms", 0, 5e-2), ("flat_a", 0.5, 1e-3),
-                                  ("flat_b", 2, 1e-3), ("flat_c", 6, 1e-3)):  # fmt: skip
+    for name, light, exposure in (
+        ("dark_1ms", 0, 1e-3),
+        ("dark_50ms", 0, 5e-2),
+        ("flat_a", 0.5, 1e-3),
+        ("flat_b", 2, 1e-3),
+        ("flat_c", 6, 1e-3),
+    ):
         np.save(folder / f"{name}.npy", few_electrons(light, exposure))
     counts = {"dark": 0.01, "flat": 0.3, "dim": 1.6, "bright": 16}
     for name, mean in counts.items():
@@ -169,8 +174,27 @@ def _calibration(folder: Path) -> None:
         )
     for name, share in (("dark_sums", 0.01), ("flat_sums", 0.3)):
         np.save(folder / f"{name}.npy", rng.binomial(50, share, (4, 24, 24)).astype(np.uint16))
-    subprocess.run([sys.executable, "-m", "qsim", "render", "fan", "-o", "out/fan", "--frames", "3", "--height", "32",
-                    "--width", "32", "-q"], cwd=folder, check=True, env=_environment())  # fmt: skip
+    subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "qsim",
+            "render",
+            "fan",
+            "-o",
+            "out/fan",
+            "--frames",
+            "3",
+            "--height",
+            "32",
+            "--width",
+            "32",
+            "-q",
+        ],
+        cwd=folder,
+        check=True,
+        env=_environment(),
+    )
 
 
 BEFORE: dict[str, Callable[[Path], None]] = {"docs/calibrate.md": _calibration}

@@ -81,7 +81,7 @@ def test_what_is_assumed_is_printed(folder, capsys):
         ("--bits 1 --dark dark_planes.npy 1e-5 --flat flat_planes.npy 1e-5", "1 bit per code cannot tell gain"),
         ("--bits 8 --model spad --paralyzable --ignore-dead-time --dark dark.npy 1e-5", "takes no dead time"),
     ],
-)  # fmt: skip
+)
 def test_options_that_cannot_act_are_refused(folder, capsys, words, message):
     assert main(["calibrate", *words.split(), "-o", "x.toml"]) == 2
     error = capsys.readouterr().err

@@ -24,8 +24,11 @@ def test_command_writes_numbers_figure_and_streams(clip, tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found == json.loads((out / "tradeoff.json").read_text())
     assert [(row["model"], row["bits"]) for row in found["rows"]] == [
-        ("planes", 1), ("planes", 3), ("multibit", 1), ("multibit", 3),
-    ]  # fmt: skip
+        ("planes", 1),
+        ("planes", 3),
+        ("multibit", 1),
+        ("multibit", 3),
+    ]
     assert (out / "tradeoff.png").read_bytes().startswith(b"\x89PNG")
     deep, shallow = (Clip.open(out / "streams" / f"wave_{bits}bit") for bits in (3, 1))
     assert deep.streams == ("multibit", "planes")

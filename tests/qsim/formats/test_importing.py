@@ -159,8 +159,10 @@ def test_codes_of_a_named_sensor_have_its_law(tmp_path: Path):
     np.save(tmp_path / "codes.npy", np.random.default_rng(0).integers(0, 8, (2, 5, 6)).astype(np.uint8))
     recording = importing.read(tmp_path / "codes.npy", Hints(bits=3))
     for name, ppp, model, planes in [
-        (None, None, "binary_sum", 7), ("spad-320x240", None, "binary_sum", 7), ("quiver-physical", 3.25, "multibit", 1)
-    ]:  # fmt: skip
+        (None, None, "binary_sum", 7),
+        ("spad-320x240", None, "binary_sum", 7),
+        ("quiver-physical", 3.25, "multibit", 1),
+    ]:
         stream = importing.to_stream(recording, tmp_path / str(name), Import(1000.0, sensor=name, ppp=ppp))
         assert (stream.info.code_model, stream.info.planes_per_code) == (model, planes)
         assert stream.sensor.code_model == model
@@ -175,9 +177,14 @@ def test_opening_an_unfinished_stream(tmp_path: Path):
 
 
 SATURATING = {  # kind -> (largest value of the file's pixels, colour)
-    "png8": (255, False), "png16": (65535, False), "colour": (255, True), "tiff": (65535, False),
-    "npy": (65535, False), "mp4": (255, False), "floats": (None, False),
-}  # fmt: skip
+    "png8": (255, False),
+    "png16": (65535, False),
+    "colour": (255, True),
+    "tiff": (65535, False),
+    "npy": (65535, False),
+    "mp4": (255, False),
+    "floats": (None, False),
+}
 
 
 @pytest.mark.parametrize("kind", SATURATING)
@@ -213,9 +220,20 @@ def test_saturated_pixels_are_counted_marked_and_reported(
         source = source / "a.npy"
         np.save(source, shown.astype(np.float32 if kind == "floats" else np.uint16))
     level = [] if white is None else ["--white", str(white / 255 if kind == "floats" else white)]
-    line = ["convert", str(source), str(tmp_path / "clip"), "--frame-rate", "1000", "--transfer", "linear",
-            "--layout", {"tiff": "tiff", "mp4": "video"}.get(kind, "png" if source.is_dir() else "light"),
-            "--flip", "lr", *level]  # fmt: skip
+    line = [
+        "convert",
+        str(source),
+        str(tmp_path / "clip"),
+        "--frame-rate",
+        "1000",
+        "--transfer",
+        "linear",
+        "--layout",
+        {"tiff": "tiff", "mp4": "video"}.get(kind, "png" if source.is_dir() else "light"),
+        "--flip",
+        "lr",
+        *level,
+    ]
     assert main(line) == 0
     said = capsys.readouterr().out
     assert "3 frames of 8 x 10 pixels at 1000 per second, exposure 1000 us" in said

@@ -168,14 +168,25 @@ def test_convert_and_calibrate_read_the_same_layout(tmp_path: Path, capsys: pyte
     frames = np.random.default_rng(1).integers(0, 8, (20, 5, 7))
     path = tmp_path / "dark.raw"
     path.write_bytes(raw_bytes(frames, "packed", 3, "lsb", 16, 1))
-    words = ["--layout", "raw", "--height", "5", "--width", "7", "--order", "lsb", "--skip-bytes", "16",
-             "--row-padding", "1"]  # fmt: skip
+    words = [
+        "--layout",
+        "raw",
+        "--height",
+        "5",
+        "--width",
+        "7",
+        "--order",
+        "lsb",
+        "--skip-bytes",
+        "16",
+        "--row-padding",
+        "1",
+    ]
     out = tmp_path / "s.npy"
     assert main(["convert", str(path), str(out), "--bits", "3", "--frame-rate", "1000", *words]) == 0
     assert "read as 20 frames of 5 x 7 pixels of 3 bits, packed, lowest bit first" in capsys.readouterr().err
     hints = Hints("raw", 5, 7, order="lsb", skip_bytes=16, row_padding=1)
     found = read_stack(path, bits=3, exposure=1e-3, photons=0.0, hints=hints)
     assert np.array_equal(found.total, frames.sum(axis=0))
-    stream = importing.to_stream(importing.read(path, replace(hints, bits=3)),
-                                 tmp_path / "t", CAPTURE)  # fmt: skip
+    stream = importing.to_stream(importing.read(path, replace(hints, bits=3)), tmp_path / "t", CAPTURE)
     np.testing.assert_array_equal(stream.codes(), frames)

@@ -79,21 +79,26 @@ def test_batches_sizes_and_frame_counts_give_all_stages():
 
 
 MISTAKES = {  # what is written, what is written wrongly; each exactly once in the module
-    "ring of the splat empty": ("average_splat(self.ringed(ahead), flow)",
-                                "self.ringed(average_splat(ahead, flows.forward[:, i - 1]))"),
+    "ring of the splat empty": (
+        "average_splat(self.ringed(ahead), flow)",
+        "self.ringed(average_splat(ahead, flows.forward[:, i - 1]))",
+    ),
     "oldest first": ("for canvas, flow in kept", "for canvas, flow in reversed(kept)"),
     "ring of zeros": ("filled = canvas.clone()", "filled = torch.zeros_like(canvas)"),
     "ring of the newest": ("filled = canvas.clone()", "filled = kept[0][0].clone()"),
     "no mask": ("(moved[:, -1:] >= VALID)", "1"),
     "border padding": ('flow, "zeros")', 'flow, "border")'),
-    "state warped on the canvas": ("state = warp_inside(state, flows.backward[:, o - 1])",
-                                   "state = centre(warp_inside(self.ringed(state), "
-                                   "self.ringed(flows.backward[:, o - 1])), state.shape[-2:])"),
+    "state warped on the canvas": (
+        "state = warp_inside(state, flows.backward[:, o - 1])",
+        "state = centre(warp_inside(self.ringed(state), self.ringed(flows.backward[:, o - 1])), state.shape[-2:])",
+    ),
     "order of the decoder": ("torch.cat([state, ahead], dim=1)", "torch.cat([ahead, state], dim=1)"),
-    "ReLU after the sum": ("return x + self.conv2(F.relu(self.conv1(x)))",
-                           "return F.relu(x + self.conv2(F.relu(self.conv1(x))))"),
+    "ReLU after the sum": (
+        "return x + self.conv2(F.relu(self.conv1(x)))",
+        "return F.relu(x + self.conv2(F.relu(self.conv1(x))))",
+    ),
     "map after the state": ("torch.cat([image, noise, state], dim=1)", "torch.cat([image, state, noise], dim=1)"),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
