@@ -24,7 +24,7 @@ from qsim import colour
 from qsim.files import VERSION, write_bytes, write_json
 from qsim.streams.clip import Clip
 from qsim.tables import markdown_table
-from quiver.data.clips import mean_light, open_clips, peak_of, truth
+from quiver.data.clips import open_clips, peak_of
 from quiver.data.codes import Codes, array_codes, sensed
 from quiver.data.illumination import Illumination
 from quiver.data.photon_counts import Counts, read_counts
@@ -57,11 +57,11 @@ def moved(codes: Codes, first: int) -> Codes:
 
 def shift(clip: Clip, light: Illumination, method: Restorer) -> dict[str, float]:
     """Return the rms difference of a shift by one pixel along both sides and the rms error, both over the peak."""
-    codes, factor = sensed(clip, light, 0)
-    peak = peak_of(mean_light(clip, factor))
-    t = len(clip) // 2
+    codes, truth = sensed(clip, light, 0)
+    peak = peak_of(truth.mean_light)
+    t = len(truth) // 2
     here, there = (method.restore(moved(codes, first), t, t + 1)[0].clip(0, peak) / peak for first in (0, 1))
-    target = truth(clip, factor, t, t + 1)[0].clip(0, peak)[:-1, :-1] / peak
+    target = truth.sharp(t).clip(0, peak)[:-1, :-1] / peak
     inner = (slice(EDGE, -EDGE), slice(EDGE, -EDGE))
     difference = (here[1:, 1:] - there[:-1, :-1])[inner]
     return {"difference": rms(difference), "error": rms((here - target)[inner])}
@@ -108,13 +108,13 @@ def crops(clip: Clip, own: str) -> Image.Image:
     """Return one frame, a row for every level of light: a code, the best rival, the restorer, the truth."""
     rows = []
     for ppp in SHOWN:
-        codes, factor = sensed(clip, Illumination.of("quiver-physical", ppp, 3), 0)
-        peak = peak_of(mean_light(clip, factor))
-        t = len(clip) // 2
+        codes, truth = sensed(clip, Illumination.of("quiver-physical", ppp, 3), 0)
+        peak = peak_of(truth.mean_light)
+        t = len(truth) // 2
         shown = {f"{ppp:g} PPP: one frame": codes.read(t, t + 1)[0] / (codes.sensor.levels - 1.0)}
         for name in (RIVAL, own):
             shown[name] = restorer(name).restore(codes, t, t + 1)[0] / peak
-        shown["truth"] = truth(clip, factor, t, t + 1)[0] / peak
+        shown["truth"] = truth.sharp(t) / peak
         rows.append(np.hstack([captioned(picture, text) for text, picture in shown.items()]))
     return Image.fromarray(np.vstack(rows))
 

@@ -26,7 +26,7 @@ from qsim.figures import new_figure, write_figure
 from qsim.files import VERSION, read_json, write_bytes, write_json
 from qsim.streams.clip import Clip
 from qsim.tables import markdown_table
-from quiver.data.clips import known, mean_light, open_clips, peak_of, truth
+from quiver.data.clips import open_clips, peak_of
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
@@ -135,14 +135,14 @@ def measured(
 
     None for a classical method that cannot restore such codes.
     """
-    codes, factor = sensed(clip, light, 0)
-    peak = peak_of(mean_light(clip, factor))
-    frames = np.unique(np.linspace(0, len(clip) - 1, args.frames + 2).round().astype(int)[1:-1]).tolist()
-    target = np.concatenate([truth(clip, factor, t, t + 1) for t in frames]) / peak
-    parts = [known(clip, t, t + 1) for t in frames]
+    codes, truth = sensed(clip, light, 0)
+    peak = peak_of(truth.mean_light)
+    frames = np.unique(np.linspace(0, len(truth) - 1, args.frames + 2).round().astype(int)[1:-1]).tolist()
+    target = np.stack([truth.sharp(t) for t in frames]) / peak
+    parts = [truth.known(t, t + 1) for t in frames]
     valid = None if parts[0] is None else np.concatenate([part for part in parts if part is not None])
-    moves = [speeds(clip, range(t, t + 1)) for t in frames]
-    speed = np.concatenate([move for move in moves if move is not None]) if clip.has_truth else None
+    moves = [speeds(truth, range(t, t + 1)) for t in frames]
+    speed = np.concatenate([move for move in moves if move is not None]) if truth.has_truth else None
     found: dict[str, dict[str, Any] | None] = {}
     for name in names:
         method = restorer(args.restorer if name == "restorer" else name)

@@ -99,6 +99,6 @@ def learned(name: str, rate: str, minutes: float, clip: Clip, args: argparse.Nam
 
 def restored(run: Path, clip: Clip, data: Path) -> ComparisonRow:
     """Return the scores of a clip restored by the weights of a run, from the codes that the run learned from."""
-    codes, factor = sensed(clip, LIGHT)
+    codes, truth = sensed(clip, LIGHT)
     method = restorer(str(run), RestoreOptions(device="cpu"))
-    return restore_clip(method, clip, LIGHT, Comparison(str(data), lights=(LIGHT,)), codes, factor)
+    return restore_clip(method, clip, LIGHT, Comparison(str(data), lights=(LIGHT,)), codes, truth)

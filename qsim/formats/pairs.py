@@ -24,6 +24,7 @@ from numpy import ndarray as Array
 from qsim.clip.manifest import check_outside
 from qsim.files import VERSION, Progress, replacing
 from qsim.streams.clip import Clip
+from qsim.streams.code_truth import CodeTruth
 from qsim.streams.stream import Stream
 
 WINDOW = 11  # frames, as QUIVER takes them
@@ -47,13 +48,14 @@ class Window:
         return self.stream.truth(self.first, self.first + self.frames).astype(np.float32)
 
     def flow(self) -> Array:
-        """Return the flow, float32 [T, 2, H, W]; NaN where hidden or unknown, for sums of frames and rolling rows."""
+        """Return the flow, float32 [T, 2, H, W]; NaN where hidden or unknown, after the last code, and for rows that
+        have their own time.
+        """
         found = np.full((self.frames, 2, *self.clip.shape[1:]), np.nan, np.float32)
-        single = self.stream.info.planes_per_code == 1 and self.stream.rows is None
-        if self.clip.has_truth and single:
-            for n, t in enumerate(range(self.first, self.first + self.frames)):
-                if t + 1 < len(self.clip):
-                    found[n] = np.where(self.clip.valid(t), self.clip.flow(t), np.nan)
+        truth = CodeTruth(self.clip, self.stream.timing)
+        for n, t in enumerate(range(self.first, min(self.first + self.frames, len(self.stream) - 1))):
+            flow, valid = truth.motion(t)
+            found[n] = np.where(valid, flow, np.nan)
         return found
 
     def facts(self) -> dict[str, Any]:

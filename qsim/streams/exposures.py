@@ -128,16 +128,16 @@ class Exposures:
         """Return the frame number in the key of code t: planes are numbered one by one."""
         return t * self.timing.frames if self.timing.summed else t
 
-    def light(self, read: Read, start: int, stop: int) -> Array:
-        """Return the photons [n, H, W] of each exposure of codes start ... stop - 1; `read` gives those of a frame."""
-        return np.stack([self._total(read, exposure) for t in range(start, stop) for exposure in self[t]])
+    def light(self, read: Read, start: int, stop: int, crop: Crop | None = None) -> Array:
+        """Return the photons [n, h, w] of each exposure of codes start ... stop - 1; `read` gives those of a frame."""
+        return np.stack([self._total(read, exposure, crop) for t in range(start, stop) for exposure in self[t]])
 
-    def _total(self, read: Read, exposure: Exposure) -> Array:
-        """Return the photons [H, W] of one exposure."""
+    def _total(self, read: Read, exposure: Exposure, crop: Crop | None) -> Array:
+        """Return the photons [h, w] of one exposure."""
         if len(exposure.frames) > 1:
-            return np.asarray(self.slices(read, exposure).sum(axis=0))
+            return np.asarray(self.slices(read, exposure, crop).sum(axis=0))
         (part,) = exposure.parts
-        return part * self.delayed(read, exposure.frames.start)
+        return part * self.delayed(read, exposure.frames.start, crop)
 
     def slices(self, read: Read, exposure: Exposure, crop: Crop | None = None) -> Array:
         """Return the photons [frames, h, w] of each part of an exposure; crop = (y, x, height, width) [px]."""
@@ -152,15 +152,23 @@ class Exposures:
         whole = (0, 0, *self.shape[1:])
         return rows.delayed(read, t, crop or whole, self.shifts)
 
-    def middle(self, read: Read, t: int, at: str = "row") -> Array:
-        """Return `read` [..., H, W] of the clip frame in the middle of code t: of each row's exposure, or (`at` is
+    def middle(self, read: Read, t: int, at: str = "row", crop: Crop | None = None) -> Array:
+        """Return `read` [..., h, w] of the clip frame in the middle of code t: of each row's exposure, or (`at` is
         "frame") of all of them together. Of an even number of frames it is the later of two.
         """
         rows = self.timing.rows
-        middle = (t + 0.5) * self.timing.frames
         if rows is None or at == "frame":
-            return read(math.floor(middle + self.shifts.mean()), None)
-        return rows.picked(read, np.floor(middle + self.shifts).astype(int), (0, 0, *self.shape[1:]))
+            return read(self.middle_frame(t), crop)
+        numbers = np.floor(self._middle(t) + self.shifts).astype(int)
+        return rows.picked(read, numbers, crop or (0, 0, *self.shape[1:]))
+
+    def middle_frame(self, t: int) -> int:
+        """Return the clip frame in the middle of code t, of all its rows together."""
+        return math.floor(self._middle(t) + self.shifts.mean())
+
+    def _middle(self, t: int) -> float:
+        """Return the middle of code t of the first row [clip frames]."""
+        return (t + 0.5) * self.timing.frames
 
     def about_flicker(self, strengths: Mapping[str, Array]) -> str:
         """Return how the light of a code differs from its truth, that of its middle clip frame; empty below UNEVEN.

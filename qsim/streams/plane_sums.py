@@ -54,7 +54,10 @@ class PlaneSums(PlaneRange):
     """Which planes of a recording are used, and how many of them make a code."""
 
     planes: Annotated[
-        Summed | None, setting("recordings of single bits: so many successive planes are summed to a code", unset="1")
+        Summed | None,
+        setting(
+            "successive planes that are summed to a code: of single bits, or frames of a clip sensed now", unset="1"
+        ),
     ] = None
 
     def __post_init__(self) -> None:

@@ -29,8 +29,8 @@ from qsim.optics.radiometry import Crop, check_crop
 from qsim.sensor import packing
 from qsim.sensor.defects import defect_table, good_pixels
 from qsim.sensor.defects.defect_table import Defects
+from qsim.streams.code_truth import CodeTruth
 from qsim.streams.exposures import Timing
-from qsim.streams.photons import clip_photons
 from qsim.streams.plane_sums import Sums
 from qsim.streams.rows import Rows
 from qsim.streams.stream_info import StreamInfo
@@ -142,21 +142,19 @@ class Stream:
         if at not in ("row", "frame"):
             raise ValueError(f"{self.path}: truth at the time of each row or of the middle of the frame, got {at!r}")
         frames = self._existing(start, len(self) if stop is None else stop)
-        clip = self.clip
-        exposures = self.timing.over(clip)
-        factor = self.photons_factor * self.timing.frames
+        return self.code_truth.video(frames.start, frames.stop, at=at)
 
-        def sharp(frame: int, crop: Crop | None = None) -> Array:
-            return clip_photons(clip, frame, factor, crop, sharp=True)
+    @cached_property
+    def code_truth(self) -> CodeTruth:
+        """The truth of each code: sharp and mean light, flow to the next, validity, depth and bodies.
 
-        return np.stack([exposures.middle(sharp, t, at) * exposures.strength(t) for t in frames])
+        `ValueError` for an imported stream, `FileNotFoundError` for one without a clip.
+        """
+        return CodeTruth(self.clip, self.timing, self.photons_factor)
 
     def known(self) -> Array | None:
         """Return bool [T, H, W], False where light of `truth` is cut off (`Clip.saturated`); None if all is known."""
-        if self.clip.bands is not None or not self.clip.info.saturated_pixels:  # of colour they are counted only
-            return None
-        exposures = self.timing.over(self.clip)
-        return ~np.stack([exposures.middle(self.clip.saturated, t) for t in range(len(self))])
+        return CodeTruth(self.clip, self.timing).known()
 
     @cached_property
     def timing(self) -> Timing:

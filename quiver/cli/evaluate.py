@@ -46,7 +46,7 @@ IDLE = (
     ),
     Idle(
         lambda asked, *_: "" if asked.static else "belongs to --static COUNTS",
-        ("frames", "splits", "width", "planes", "start", "stop", "every"),
+        ("frames", "splits", "width", "start", "stop", "every"),
     ),
     Idle(
         lambda asked, *_: f"--protocol {asked.protocol} decides it" if asked.protocol else "",
@@ -62,7 +62,7 @@ IDLE = (
     ),
     Idle(
         lambda asked, *_: f"stream {asked.stream} is stored and has its own" if asked.stream else "",
-        ("sensor", "ppp", "bits", "seed"),
+        ("sensor", "ppp", "bits", "planes", "seed"),
     ),
     Idle(
         lambda asked, *_: (
@@ -75,6 +75,7 @@ IDLE = (
 
 @command(
     "quiver evaluate out/starter -o out/table --methods naive,moment,out/mine,out/unet --ppp 3.25,9.75,26",
+    "quiver evaluate out/planes -o out/sums --sensor spad-320x240 --planes 7 --ppp 4.9",
     "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,mergenet --split all",
     "quiver evaluate I2-2000FPS/test -o out/published --protocol quiver-published --methods moment,out/mine",
     "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,mergenet",
@@ -101,7 +102,7 @@ def evaluate(asked: EvaluateSettings, sums: PlaneSums, options: RestoreOptions, 
     from quiver.evaluation import comparison as scoring
     from quiver.evaluation import summary
 
-    with _prepared(asked, methods) as (comparison, remarks):
+    with _prepared(asked, sums.planes, methods) as (comparison, remarks):
         with bar("rows", "row") as progress:
             rows = scoring.evaluate(comparison, methods, asked.folder, lambda what, done, total: progress(done, total))
         summary.write(asked.folder, comparison, methods, rows, remarks)
@@ -110,11 +111,13 @@ def evaluate(asked: EvaluateSettings, sums: PlaneSums, options: RestoreOptions, 
 
 
 @contextlib.contextmanager
-def _prepared(asked: EvaluateSettings, methods: Sequence[Any]) -> Iterator[tuple[Comparison, list[str]]]:
+def _prepared(
+    asked: EvaluateSettings, planes: int | None, methods: Sequence[Any]
+) -> Iterator[tuple[Comparison, list[str]]]:
     """Check what `quiver evaluate` scores, then hold the folder of its results; yield the settings and remarks."""
     from quiver.evaluation.comparison import check, streams
 
-    comparison = _comparison(asked)
+    comparison = _comparison(asked, planes)
     if comparison.test_set is None:
         check(comparison)
         remarks = check_domain(asked, methods, streams(comparison))
@@ -155,7 +158,7 @@ def _folder(asked: EvaluateSettings, comparison: Comparison) -> Iterator[None]:
         lock.delete()
 
 
-def _comparison(asked: EvaluateSettings) -> Comparison:
+def _comparison(asked: EvaluateSettings, planes: int | None) -> Comparison:
     """Return what `quiver evaluate` scores on the clips of a data set, or on one clip."""
     from quiver.data.illumination import Illumination
     from quiver.evaluation.comparison import Comparison
@@ -167,7 +170,7 @@ def _comparison(asked: EvaluateSettings) -> Comparison:
     sensor = asked.sensor or ("quiver-published" if asked.published else "quiver-physical")
     own = sensor.endswith(".toml")  # the file states the bits
     lights = tuple(
-        Illumination.of(sensor, ppp, bits)
+        Illumination.of(sensor, ppp, bits).over(planes, bits if asked.bits else None)
         for bits in asked.bits or ((None,) if own else (3,))
         for ppp in asked.ppp or (3.25,)
     )

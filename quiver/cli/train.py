@@ -115,6 +115,8 @@ def settings_of_run(bundle: str, given: Mapping[str, Any]) -> Settings:
     defaults = dict(protocol(system_named(given.get("network", Settings.network)), bundle))
     if any(sensor.endswith(".toml") for sensor in given.get("sensor", ())):
         defaults.pop("bits", None)  # a sensor file states its own; a named sensor beside it has those of the streams
+    if "planes" in given:
+        defaults.pop("bits", None)  # those of a sum follow from its planes
     data = given["data"]
     if isinstance(data, tuple) and len(data) == 1:
         data = data[0]
@@ -126,7 +128,7 @@ def _of_stream(given: Mapping[str, Any], settings: Settings) -> Settings:
     from quiver.data.stream_windows import stream_at
     from quiver.training.self_supervised import own_light
 
-    for name in ("sensor", "ppp", "bits", "temperature", "validate_every", "validation_split"):
+    for name in ("sensor", "ppp", "bits", "planes", "temperature", "validate_every", "validation_split"):
         if name in given:
             why = f"is for data sets, and {settings.network} learns from one stream"
             raise ArgumentError(name, f"{why}; leave it out")
@@ -214,7 +216,7 @@ def ablate(
     given: Annotated[
         dict[str, Any],
         Settings,
-        *("steps", "minutes", "sensor", "ppp", "bits", "temperature", "crop", "batch", "seed", "threads"),
+        *("steps", "minutes", "sensor", "ppp", "bits", "planes", "temperature", "crop", "batch", "seed", "threads"),
     ],
     options: RestoreOptions,
 ) -> int:

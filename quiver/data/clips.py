@@ -1,31 +1,24 @@
-"""Opens the clips of a data set and gives their sharp photons, their valid pixels and the peak of a score."""
+"""Opens the clips of a data set, and gives the peak of a score."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy import ndarray as Array
-
 from qsim.clip.manifest import check_outside
 from qsim.dataset.dataset import Dataset
 from qsim.files import sha256, to_json
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.streams.clip import Clip
-from qsim.streams.photons import clip_photons
 
 __all__ = [
     "Clip",
     "check_outside",
     "clips_digest",
     "has_sharp",
-    "known",
-    "mean_light",
     "open_clips",
     "peak_of",
     "split_clips",
-    "truth",
     "unfinished",
 ]
 
@@ -77,25 +70,6 @@ def unfinished(folders: Iterable[str]) -> list[str]:
 def has_sharp(clip: Clip) -> bool:
     """Return whether the clip stores sharp frames beside the exposed ones."""
     return clip.info.has_sharp
-
-
-def truth(clip: Clip, factor: float, start: int, stop: int) -> Array:
-    """Return the sharp expected photons, float64 [stop - start, H, W], of a clip under a light factor: the target of a
-    restorer.
-    """
-    return np.stack([clip_photons(clip, t, factor, sharp=True) for t in range(start, stop)])
-
-
-def known(clip: Clip, start: int, stop: int) -> Array | None:
-    """Return bool [stop - start, H, W], false where a saturated camera cut off the light; None if all are valid."""
-    if clip.bands is not None or not clip.info.saturated_pixels:  # pixels of colour clips are counted only
-        return None
-    return ~np.stack([clip.saturated(t) for t in range(start, stop)])
-
-
-def mean_light(clip: Clip, factor: float) -> float:
-    """Return the mean expected photons per pixel and exposure of a clip under a light factor."""
-    return factor * (clip.mean_radiance if clip.camera is None else clip.mean_photons)
 
 
 def peak_of(light: float, peak: float | None = None) -> float:

@@ -30,6 +30,8 @@ from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.demosaicing import demosaic, determines_bands
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
+from qsim.streams.code_truth import CodeTruth
+from qsim.streams.exposures import Timing
 from qsim.streams.photons import clip_photons
 from qsim.streams.plane_sums import PlaneSums, Sums
 from qsim.streams.preparation import followed
@@ -40,6 +42,7 @@ from quiver.data.code_table import draw_codes
 from quiver.data.illumination import Illumination
 
 __all__ = [
+    "CodeTruth",
     "Codes",
     "LazyArray",
     "Sensor",
@@ -280,8 +283,8 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
     return Codes(name, codes.shape, sensor, exposure, 1 / exposure, read, source, lambda: array_digest(codes))
 
 
-def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float]:
-    """Return the codes of a clip under a light level, and the light factor: the codes that `qsim sense` would store.
+def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, CodeTruth]:
+    """Return the codes of a clip under a light level, those that `qsim sense` would store, and their truth.
 
     Codes are drawn when they are read, those of pixels followed photon by photon all at once; dead and hot pixels of
     the sensor's defects are filled.
@@ -290,10 +293,11 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
     draw, _ = followed(clip, sensing, light.draw(clip, seed))
     shape = clip.shape[1], clip.shape[2]
     bad = defects.of_draw(draw, clip.exposure, shape)
+    truth = CodeTruth(clip, draw.timing, draw.level.factor)
 
     @cache
     def complete() -> Array:
-        return draw.frames(clip, 0, len(clip))
+        return draw.frames(clip, 0, len(truth))
 
     def read(start: int, stop: int) -> Array:
         try:
@@ -303,19 +307,20 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
 
     codes = Codes(
         name=f"{clip.name}, {light.label}",
-        shape=clip.shape,
+        shape=(len(truth), *shape),
         sensor=defects.behind(bad, draw.defects, draw.sensor, shape, draw.origin),
-        exposure=clip.exposure,
-        frame_rate=clip.frame_rate,
+        exposure=clip.exposure * draw.planes,
+        frame_rate=clip.frame_rate / draw.planes,
         read=read,
         source=f"{clip.path} seen by {light.sensor} ({light.label}), seed {seed}",
         digest=lambda: sha256(to_json([records.plain(clip.info), records.plain(describe(clip, sensing, draw))])),
         sensor_name=light.sensor,
-        ppp=draw.level.ppp,
+        ppp=draw.level.ppp * draw.planes,
+        shares=draw.timing.shares,
         colour=draw.colour,
         not_inverted=_not_inverted(vars(draw.defects) if draw.defects else {}),
     )
-    return filled(codes, bad), draw.level.factor
+    return filled(codes, bad), truth
 
 
 def stream_codes(stream: Stream) -> Codes:
@@ -380,25 +385,33 @@ def open_stream(path: Path) -> Stream:
     return Stream.open(path.with_suffix(".json"))
 
 
-def stored(clip: Clip, name: str) -> tuple[Codes, float]:
-    """Return a stored stream of a clip and its light factor. `ValueError` where a code sums several clip frames."""
+def stored(clip: Clip, name: str) -> tuple[Codes, CodeTruth]:
+    """Return a stored stream of a clip and its truth; `ValueError` for codes of another clip."""
     stream = clip.stream(name)
-    if stream.shape != clip.shape:
+    truth = stream.code_truth
+    if stream.info.planes_of or stream.shape != (len(truth), *clip.shape[1:]):
+        raise ValueError(f"{stream.path}: its codes are not those of its clip, so their truth is not known")
+    return stream_codes(stream), truth
+
+
+def check_published(light: Illumination) -> None:
+    """Raise `ValueError` for the clip's own light, to which no window can be brought, and for codes of several."""
+    if light.ppp is None:
+        raise ValueError("the published protocol forces the exposure of every window; give ppp=")
+    if light.timing != Timing():
         raise ValueError(
-            f"{stream.path}: {list(stream.shape)}, but its clip is {list(clip.shape)}; only streams with one code per "
-            "clip frame can be scored"
+            "the published protocol has codes of one full clip frame; leave planes= out, or published=True"
         )
-    return stream_codes(stream), stream.photons_factor
 
 
 def windows_sensed(clip: Clip, light: Illumination, seed: int, centres: range) -> Iterator[Codes]:
-    """Draw the windows of the published test: 11 frames each, brought to the light level one by one, with separate
+    """Draw the windows of the published test: 11 codes each, brought to the light level one by one, with separate
     noise.
 
-    `ValueError` for the clip's own light (`ppp` None), which has no level to bring a window to.
+    `ValueError` as of `check_published`, and for a colour clip.
     """
-    if light.ppp is None:
-        raise ValueError("the published protocol forces the exposure of every window; give ppp=")
+    check_published(light)
+    assert light.ppp is not None
     clip.require_one_band("the published protocol")
     sensor = light.device(clip.exposure)
     for t in centres:

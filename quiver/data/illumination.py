@@ -3,8 +3,7 @@
     settings of `qsim sense` -> Illumination -> draw (of a clip), sensor
     stored stream            -> Illumination, with the sensor and the defects that the stream states
 
-A training window is one exposure of one clip frame per code, all rows at once. It honours the settings in HONOURED;
-`refuse_others` refuses the rest.
+A training window honours the settings in HONOURED; `refuse_others` refuses the rest.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
+from qsim.checks import ArgumentError
 from qsim.files import sha256, to_json
 from qsim.sensor import colour_filter, devices
 from qsim.sensor.defects.defect_table import Defects, from_toml
@@ -25,6 +25,7 @@ from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.settings import given
 from qsim.streams.clip import Clip
+from qsim.streams.exposures import Timing
 from qsim.streams.preparation import assemble, prepare
 from qsim.streams.sensing import Sensing
 from qsim.streams.simulation import Draw
@@ -33,9 +34,9 @@ from qsim.streams.stream import Stream
 DEFAULT = Sensing("quiver-physical", bits=3, ppp=3.25)
 ALWAYS = ("sensor", "bits", "ppp")  # keys of every stored description
 LEVEL = (*ALWAYS, "lux")  # settings that the text of a light states in its own words
-HONOURED = (*LEVEL, "diffraction", "defects", "temperature", "pixel_pitch")
-# Settings of streams that `unlike_windows` knows by what they led to, or that change no law of the codes
-STATED = ("seed", "name", "group", "slices", "row_delay", "row_order", "exposures", "follow")
+TIMES = ("group", "slices", "row_delay", "row_order", "exposures", "light_drift")  # when codes collect light
+HONOURED = (*LEVEL, *TIMES, "diffraction", "defects", "temperature", "pixel_pitch")
+STATED = ("seed", "name", "follow")  # settings that change no law of the codes
 OTHERS = "give sensor=, bits= and ppp=, in Python WindowSettings(lights=...)"  # where a stream's noise is of no use
 LONGEST = 500  # characters of a stored name
 
@@ -133,6 +134,51 @@ class Illumination:
         """Bits per code; None: the sensor's own."""
         return self.sensing.bits
 
+    @property
+    def planes(self) -> int:
+        """Clip frames of a code."""
+        return self.sensing.planes
+
+    @property
+    def timing(self) -> Timing:
+        """When codes collect light."""
+        return self.sensing.timing(self.planes, self.sensing.group)
+
+    def over(self, planes: int | None, bits: int | None = None) -> Illumination:
+        """Return the same with codes over so many clip frames; None: as it is.
+
+        A clocked SPAD sums them as planes, which decides the bits of its codes. Of other sensors they are slices of an
+        exposure. `ValueError` for a sum of other bits than those that are asked for, or that the sensor's file has.
+        """
+        if planes is None:
+            return self
+        if planes == 1 or not self.device(5e-4).sums_planes:
+            return self.but(group=False, slices=planes)
+        depth = planes.bit_length()
+        if planes != 2**depth - 1:
+            near = f"{2 ** (depth - 1) - 1} or {2**depth - 1}"
+            raise ArgumentError("planes", f"a b-bit code sums 2^b - 1 planes, got {planes}; give {near}")
+        fixed = bits if self.record is None else self.bits
+        if fixed not in (None, depth):
+            raise ArgumentError(
+                "planes",
+                f"a sum of {planes} planes has {depth} bits, and {fixed} are asked for; give planes= or bits= alone",
+            )
+        return self.but(group=True, slices=1, bits=depth)
+
+    def timed_as(self, other: Illumination) -> Illumination:
+        """Return the same with rows, shares and drift of another noise."""
+        return self.but(**{name: getattr(other.sensing, name) for name in TIMES if name not in ("group", "slices")})
+
+    def over_as_many_as(self, other: Illumination) -> Illumination:
+        """Return the same with codes over as many clip frames as those of another noise.
+
+        Where those are planes of a sum, one for each plane of this sensor's bits.
+        """
+        if other.sensing.group and self.device(5e-4).sums_planes:
+            return self.but(group=True)
+        return self.over(other.planes)
+
     def but(self, **changes: Any) -> Illumination:
         """Return the same with other settings of `Sensing`."""
         return replace(self, sensing=replace(self.sensing, **changes))
@@ -182,14 +228,18 @@ class Illumination:
         found = None if self.defects is None else stored_defects(self.defects)
         if self.record is None:
             return assemble(clip, sensing, found)
-        own = self.device(clip.exposure, None if clip.camera is None else clip.camera.wavelength)
+        own = self.device(clip.exposure * self.planes, None if clip.camera is None else clip.camera.wavelength)
         return assemble(clip, replace(sensing, temperature=None), found, own)
 
     @property
     def others(self) -> list[str]:
         """The settings beside sensor, light and bits, as text: `diffraction`, `temperature 40`."""
-        rest = {name: value for name, value in given(self.sensing).items() if name not in (*LEVEL, "seed", "name")}
-        return [name if value is True else f"{name} {_short(value)}" for name, value in rest.items()]
+        left_out = (*LEVEL, "seed", "name", "group", "slices")
+        rest = {name: value for name, value in given(self.sensing).items() if name not in left_out}
+        found = [name if value is True else f"{name} {_short(value)}" for name, value in rest.items()]
+        if self.planes == 1:
+            return found
+        return [f"{self.planes} {'planes' if self.sensing.group else 'slices'}", *found]
 
     @property
     def light(self) -> str:
@@ -225,24 +275,17 @@ def _with_own_spread(file: str, found: Defects | None) -> dict[str, Any]:
 
 def unlike_windows(stream: Stream) -> list[str]:
     """Return the settings of a stored stream that training windows cannot have."""
-    unlike = []
-    planes = stream.info.planes_per_code
-    if planes != 1:
-        unlike.append(f"codes of {planes} clip frames")
-    if stream.rows is not None:
-        unlike.append("rows at their own time")
-    if stream.shares is not None:
-        unlike.append("different exposures")
-    return unlike + [name for name in stream.info.settings if name not in (*HONOURED, *STATED)]
+    unlike = [name for name in stream.info.settings if name not in (*HONOURED, *STATED)]
+    stated = replace(stream.info.sensing, bits=stream.info.bits)
+    if stream.timing != stated.timing(stated.planes, stated.group):
+        unlike.append(f"codes of {stream.info.planes_per_code} clip frames that its settings do not state")
+    return unlike
 
 
 def refuse_others(names: Iterable[str], where: str) -> None:
     """Raise `ValueError` for settings that training windows cannot have, if there are any."""
     if unlike := ", ".join(names):
-        raise ValueError(
-            f"{where}: a training window has one full exposure of one clip frame for each code, and this has {unlike}; "
-            f"{OTHERS}"
-        )
+        raise ValueError(f"{where}: training windows cannot have {unlike}; {OTHERS}")
 
 
 # ---- Names in tables

@@ -35,16 +35,18 @@ def choose(
     ppp: Sequence[float] | None = None,
     bits: Sequence[int] | None = None,
     temperature: float | None = None,
+    planes: int | None = None,
 ) -> Mixture:
     """Return the noise of the clips' streams, changed to the requested sensors, light levels [photons/pixel] and bits.
 
-    A requested sensor has the light, bits and defects of its streams. Without any, it has light and bits of other
-    streams, and the defects of its file, at `temperature` [degrees C]. Without streams, the default sensor and light
-    are used. `ValueError` for a stream whose noise training windows cannot have, and for a temperature without sensors.
+    A requested sensor has the light, bits, clip frames per code and defects of its streams. Without any, it has light,
+    bits and clip frames of other streams, and the defects of its file, at `temperature` [degrees C]. Without streams,
+    the default sensor and light are used. Codes over `planes` clip frames are those of `Illumination.over`.
+    `ValueError` for a stream whose noise training windows cannot have, and for a temperature without sensors.
     """
     if temperature is not None and not sensors:
         raise ArgumentError("temperature", "is that of sensor files, and streams have theirs; name the sensor, too")
-    asked = bool(sensors or ppp or bits)
+    asked = bool(sensors or ppp or bits or planes)
     streams = _streams(clips)
     if sensors and ppp and (bits or all(map(_is_file, sensors))):  # the streams decide nothing
         streams = [stream for stream in streams if not unlike_windows(stream)]
@@ -57,7 +59,7 @@ def choose(
     for sensor in sensors or (None,):
         own = tuple(noise for noise in base if noise.sensor == sensor) or base
         asked_for += [
-            _changed(noise, sensor, level, depth, temperature)
+            _changed(noise, sensor, level, depth, temperature, planes)
             for noise in own
             for depth in bits or (None,)
             for level in ppp or (None,)
@@ -90,13 +92,19 @@ def _place(noise: Illumination) -> tuple[object, ...]:
 
 
 def _changed(
-    noise: Illumination, sensor: str | None, ppp: float | None, bits: int | None, temperature: float | None
+    noise: Illumination,
+    sensor: str | None,
+    ppp: float | None,
+    bits: int | None,
+    temperature: float | None,
+    planes: int | None,
 ) -> Illumination:
     """Return a noise with the requested changes."""
     if sensor is not None and (sensor != noise.sensor or _is_file(sensor) or temperature is not None):
         depth = bits if bits is not None or _is_file(sensor) else noise.bits
-        fresh = Illumination.of(sensor, noise.ppp, depth, temperature=temperature).stated()
-        noise = fresh.but(lux=noise.sensing.lux, diffraction=noise.sensing.diffraction)
+        fresh = Illumination.of(sensor, noise.ppp, depth, temperature=temperature).over(planes, bits).stated()
+        fresh = fresh.but(lux=noise.sensing.lux, diffraction=noise.sensing.diffraction).timed_as(noise)
+        noise = fresh if planes is not None else fresh.over_as_many_as(noise)
     if ppp is not None:
         noise = noise.but(ppp=ppp, lux=None)
     if bits is not None and bits != noise.bits:
@@ -105,7 +113,7 @@ def _changed(
                 f"{noise.sensor}: the file has bits = {noise.bits}, the request {bits}; change one of them"
             )
         noise = noise.but(bits=bits)
-    return noise
+    return noise.over(planes, bits)
 
 
 # ---- Description

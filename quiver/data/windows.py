@@ -27,7 +27,8 @@ from torch.utils.data import Dataset, Sampler
 from qsim.keys import Key
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
-from qsim.streams.photons import clip_photons
+from qsim.streams.code_truth import CodeTruth
+from qsim.streams.exposures import Timing
 from qsim.streams.simulation import Draw
 from qsim.streams.stream import Stream
 from quiver.data.clips import has_sharp, open_clips, peak_of
@@ -35,7 +36,14 @@ from quiver.data.code_table import draw_codes
 from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.data.mixture import Mixture, choose
-from quiver.data.window_noise import WindowPlace, behind_defects, check_windows, window_codes, window_filler
+from quiver.data.window_noise import (
+    WindowLight,
+    WindowPlace,
+    behind_defects,
+    check_slices,
+    check_windows,
+    window_filler,
+)
 
 # Computes inputs of a network from the codes of a window: name -> tensor, each the same shape for all windows. It runs
 # where samples are drawn, in worker processes too, and gets no gradients; it is a function of a module, not a lambda.
@@ -45,6 +53,8 @@ Prepare = Callable[[Codes], Mapping[str, torch.Tensor]]
 TRAINING = 1
 VALIDATION = 2
 STILL = 3
+# Turns that keep the direction in which rows (0) or columns (1) are read: none, and mirrored along them
+TURNS_OF_ROWS = ((0, 4), (0, 6))
 
 
 @dataclass(frozen=True)
@@ -83,6 +93,7 @@ class Windows(Dataset[dict[str, Any]]):
         sample   its number
         key      text: clip, place, light, random key
         still    float32 [T, 1, h, w] in [0, 1], codes of a scene that rests as in the centre frame, if asked for
+        shares   float32 [T], exposure of each code over a full one, of sensors whose exposures take turns
         ...      what `prepare` returns for the codes, their sensor, exposure and light
 
     Codes and target follow the sensor of their window. `noise` is the mixture that windows draw from; `repr` shows it.
@@ -113,13 +124,17 @@ class Windows(Dataset[dict[str, Any]]):
             self.noise = choose(clips)
         else:
             self.noise = Mixture(tuple(light.stated() for light in settings.lights))
+        for noise in self.noise.noises:
+            _check_codes(clips, noise, settings)
         lit = {clip.camera is None: clip for clip in reversed(clips)}  # of clips that are alike the first
         sized = {(clip.camera is None, clip.shape[1:], clip.origin): clip for clip in reversed(clips)}  # for defects
         for noise in self.noise.noises:
             for clip in (lit if noise.defects is None else sized).values():
                 check_windows(noise, clip)
                 if prepare is not None:  # from the response, which some sensors do not have
-                    noise.draw(clip).sensor.response(clip.exposure, points=2)
+                    noise.draw(clip).sensor.response(clip.exposure * noise.planes, points=2)
+            for clip in clips:
+                check_slices(noise, clip)
         self.length = len(clips) * (len(self.noise.noises) if fixed else repeats)
         self._draws: dict[tuple[int, int], tuple[Draw, Array | None, Sensor]] = {}
 
@@ -138,21 +153,26 @@ class Windows(Dataset[dict[str, Any]]):
         clip = int(np.random.default_rng((settings.seed, epoch)).permutation(self.length)[index]) % len(self.clips)
         rng = np.random.default_rng((settings.seed, epoch, index))
         length, height, width = self.clips[clip].shape
-        start = int(rng.integers(length - settings.frames + 1))
+        frame = int(rng.integers(length - settings.frames + 1))
         drift = self._drift(clip, rng)
         y, x = (
             int(rng.integers(side - settings.crop - abs(way) + 1)) + max(0, -way)
             for side, way in zip((height, width), (d * (settings.frames - 1) for d in drift), strict=True)
         )
+        light = int(rng.integers(len(self.noise.noises)))
+        turn = int(rng.integers(8)) if settings.flips else 0
+        backwards = bool(rng.integers(2)) if settings.reverse else False
+        timing = self.noise.noises[light].timing
+        codes = len(timing.over(self.clips[clip]))
         return WindowPlace(
             clip=clip,
-            start=start,
+            start=frame * (codes - settings.frames + 1) // (length - settings.frames + 1),
             y=y,
             x=x,
             drift=drift,
-            light=int(rng.integers(len(self.noise.noises))),
-            turn=int(rng.integers(8)) if settings.flips else 0,
-            backwards=bool(rng.integers(2)) if settings.reverse else False,
+            light=light,
+            turn=turn if timing.rows is None else TURNS_OF_ROWS[timing.rows.axis][turn % 2],
+            backwards=backwards and timing.rows is None,
             key=Key(seed=settings.seed, clip=n, stage=TRAINING),
         )
 
@@ -168,12 +188,13 @@ class Windows(Dataset[dict[str, Any]]):
     def _middle(self, index: int) -> WindowPlace:
         settings = self.settings
         clip = index % len(self.clips)
-        length, height, width = self.clips[clip].shape
-        start = (length - settings.frames) // 2
+        _, height, width = self.clips[clip].shape
+        light = index // len(self.clips)
+        start = (len(self.noise.noises[light].timing.over(self.clips[clip])) - settings.frames) // 2
         y = (height - settings.crop) // 2
         x = (width - settings.crop) // 2
         key = Key(seed=settings.seed, clip=index, stage=VALIDATION)
-        return WindowPlace(clip, start, y, x, (0, 0), index // len(self.clips), 0, False, key)
+        return WindowPlace(clip, start, y, x, (0, 0), light, 0, False, key)
 
     def spread(self, count: int) -> list[int]:
         """Return the numbers of at most `count` fixed windows, spread over the clips and over the light levels."""
@@ -192,24 +213,28 @@ class Windows(Dataset[dict[str, Any]]):
         place = self.place(n)
         clip = self.clips[place.clip]
         noise = self.noise.noises[place.light]
+        settings = self.settings
         draw, bad, behind = self._draw(place)
-        photons, sharp = self.photons_of(place)
+        exposure = clip.exposure * draw.planes
+        level = draw.level.ppp * draw.planes
+        light = WindowLight.of(noise, draw, clip, place, settings.frames, settings.crop)
+        photons = self._turned(light.exposed(), place)
+        sharp = self._sharp(place, photons)
         scale = 1.0
-        if self.settings.force_exposure and noise.ppp is not None:
+        if settings.force_exposure and noise.ppp is not None:
             scale = noise.ppp / max(float(photons.mean()), 1e-9)
         try:
-            if noise.defects is None:
-                codes = draw_codes(draw.sensor, photons * scale, clip.exposure, place.key)
+            if noise.defects is None and draw.timing == Timing():  # any pixel of the sensor, in its own random numbers
+                codes = draw_codes(draw.sensor, photons * scale, exposure, place.key)
             else:
-                drawn = window_codes(noise, draw, clip, place, self.settings.frames, self.settings.crop, scale)
-                filler = window_filler(bad, place, self.settings.crop, behind)
-                drawn = drawn if filler is None else filler.fill(drawn, 0)
-                codes = turned(drawn, replace(place, backwards=False))  # in the order of exposure already
+                drawn = light.drawn(scale)
+                filler = window_filler(bad, place, settings.crop, behind)
+                codes = self._turned(drawn if filler is None else filler.fill(drawn, 0), place)
         except ValueError as error:
-            raise ValueError(f"{clip.path}: window from frame {place.start}: {error}") from None
-        white = draw.sensor.white(clip.exposure)
-        peak = white if self.settings.force_exposure else peak_of(draw.level.ppp)
-        target = np.minimum(sharp / white, max(self.settings.ceiling, peak / white))  # a SPAD tells light above 2 white
+            raise ValueError(f"{clip.path}: window from code {place.start}: {error}") from None
+        white = draw.sensor.white(exposure)
+        peak = white if settings.force_exposure else peak_of(level)
+        target = np.minimum(sharp / white, max(settings.ceiling, peak / white))  # a SPAD tells light above 2 white
         sample = {
             "codes": as_input(codes, draw.sensor),
             "target": torch.from_numpy(target.astype(np.float32))[:, None],
@@ -220,53 +245,55 @@ class Windows(Dataset[dict[str, Any]]):
             "key": f"{clip.name} frame {place.start}, (y, x) ({place.y}, {place.x}), turn {place.turn}, "
             f"{'backwards, ' if place.backwards else ''}{noise.label}, {place.key}",
         }
-        if self.settings.still:
+        shares = None
+        if draw.timing.shares is not None:
+            shares = tuple(draw.timing.share(t) for t in light.codes[light.lead :])
+            sample["shares"] = torch.tensor(shares, dtype=torch.float32)
+        if settings.still:
             resting = np.broadcast_to(self._at_rest(place) * scale, photons.shape)
             key = replace(place.key, stage=STILL + place.key.stage)
-            sample["still"] = as_input(draw_codes(behind, resting, clip.exposure, key), draw.sensor)
+            sample["still"] = as_input(draw_codes(behind, resting, exposure, key), draw.sensor)
         if self.prepare is None:
             return sample
-        seen = array_codes(codes, behind, clip.exposure, name=clip.name)
-        return sample | dict(self.prepare(replace(seen, ppp=draw.level.ppp)))
+        seen = array_codes(codes, behind, exposure, name=clip.name)
+        return sample | dict(self.prepare(replace(seen, ppp=level, shares=shares)))
 
     def photons_of(self, place: WindowPlace) -> tuple[Array, Array]:
         """Return the expected photons of the exposed and of the sharp window, float64 [T, h, w] each, turned."""
         clip = self.clips[place.clip]
-        side = self.settings.crop
-        dy, dx = place.drift
         draw, _, _ = self._draw(place)
+        settings = self.settings
+        light = WindowLight.of(self.noise.noises[place.light], draw, clip, place, settings.frames, settings.crop)
+        exposed = self._turned(light.exposed(), place)
+        return exposed, self._sharp(place, exposed)
 
-        def taken(sharp: bool) -> Array:
-            return np.stack(
-                [
-                    clip_photons(
-                        clip,
-                        place.start + i,
-                        draw.level.factor,
-                        (place.y + dy * i, place.x + dx * i, side, side),
-                        sharp=sharp,
-                        diffraction=draw.diffraction and not sharp,
-                    )
-                    for i in range(self.settings.frames)
-                ]
-            )
+    def _turned(self, window: Array, place: WindowPlace) -> Array:
+        """Return a window [T, h, w], which is in the order of its exposure, turned as its place states."""
+        return turned(window, replace(place, backwards=False))
 
-        exposed = taken(sharp=False)
-        return turned(exposed, place), turned(
-            taken(sharp=True) if has_sharp(clip) or draw.diffraction else exposed, place
-        )
+    def _sharp(self, place: WindowPlace, exposed: Array) -> Array:
+        """Return the sharp photons [T, h, w] of a window, turned; those that are exposed where a clip has no others."""
+        clip = self.clips[place.clip]
+        draw, _, _ = self._draw(place)
+        if draw.timing == Timing() and not (has_sharp(clip) or draw.diffraction):
+            return exposed
+        truth = CodeTruth(clip, draw.timing, draw.level.factor)
+        return turned(np.stack([self._sharp_code(truth, place, i) for i in range(self.settings.frames)]), place)
+
+    def _sharp_code(self, truth: CodeTruth, place: WindowPlace, i: int) -> Array:
+        """Return the sharp photons [h, w] of code i of a window, not turned."""
+        dy, dx = place.drift
+        side = self.settings.crop
+        return truth.sharp(place.start + i, (place.y, place.x, side, side), moved=(dy * i, dx * i))
 
     def _at_rest(self, place: WindowPlace) -> Array:
-        """Return the photons [h, w] of the centre frame, turned, of a scene that rests there: without motion blur."""
+        """Return the photons [h, w] of the centre code, turned, of a scene that rests there: without motion blur."""
         clip = self.clips[place.clip]
-        side = self.settings.crop
         frames = self.settings.frames
-        dy, dx = place.drift
         draw, _, _ = self._draw(place)
         i = frames - 1 - frames // 2 if place.backwards else frames // 2
-        crop = (place.y + dy * i, place.x + dx * i, side, side)
-        instant = {"sharp": has_sharp(clip), "diffraction": draw.diffraction}
-        return turned(clip_photons(clip, place.start + i, draw.level.factor, crop, **instant)[None], place)[0]
+        truth = CodeTruth(clip, draw.timing, draw.level.factor, draw.diffraction)
+        return turned(self._sharp_code(truth, place, i)[None], place)[0]
 
     def _draw(self, place: WindowPlace) -> tuple[Draw, Array | None, Sensor]:
         """Return what draws the codes of a place's clip and noise, its defective pixels, and the sensor behind them."""
@@ -284,15 +311,17 @@ def windows(
     split: str | None = None,
     frames: int = 11,
     crop: int = 64,
+    planes: int | None = None,
     seed: int = 0,
     repeats: int = 1,
 ) -> Windows:
     """Return training windows for a `torch.utils.data.DataLoader`: codes, truth and light. Each number has its noise.
 
     `source` is a stream (its sensor and light), a clip, some clips, or the folder of a clip or a data set, of which
-    `split` names a part (train, val, test). A window has `frames` frames of `crop` x `crop` px; an epoch holds
-    `repeats` windows of every clip, and `Batches` gives a loader the numbers of all epochs. `Windows` states the items;
-    `WindowSettings` has more settings. `ValueError` where no window fits.
+    `split` names a part (train, val, test). A window has `frames` codes of `crop` x `crop` px, each over `planes` clip
+    frames, by default as many as in the streams; an epoch holds `repeats` windows of every clip, and `Batches` gives a
+    loader the numbers of all epochs. `Windows` states the items; `WindowSettings` has more settings. `ValueError` where
+    no window fits.
     """
     settings = WindowSettings(frames=frames, crop=crop, seed=seed)
     if isinstance(source, str | os.PathLike):
@@ -303,8 +332,12 @@ def windows(
         folder = source.clip
         clips = [Clip(folder.path, folder.info, folder.keeps)]
         settings = replace(settings, lights=(Illumination.of_stream(source),))
+        if planes is not None:
+            raise ValueError(f"planes= is for clips, and stream {source.name} has its own; leave it out")
     else:
         clips = [source] if isinstance(source, Clip) else source
+    if planes is not None:
+        settings = replace(settings, lights=choose(clips, planes=planes).noises)
     return Windows(clips, settings, repeats=repeats)
 
 
@@ -318,6 +351,17 @@ def turned(window: Array, place: WindowPlace) -> Array:
 def as_input(codes: Array, sensor: Sensor) -> torch.Tensor:
     """Return codes [T, H, W] as the input of networks: float32 [T, 1, H, W], codes / (2^b - 1)."""
     return torch.from_numpy(codes.astype(np.float32) / np.float32(sensor.levels - 1))[:, None]
+
+
+def _check_codes(clips: Sequence[Clip], noise: Illumination, settings: WindowSettings) -> None:
+    """Raise `ValueError` for a clip with fewer codes than a window has."""
+    for clip in clips:
+        codes = len(noise.timing.over(clip))
+        if codes < settings.frames:
+            raise ValueError(
+                f"clip {clip.name} has {len(clip)} frames, which give {codes} codes of {noise.planes}; a window needs "
+                f"{settings.frames}; choose fewer frames= or planes=, or longer clips"
+            )
 
 
 def check_clips(clips: Sequence[Clip], settings: WindowSettings) -> None:

@@ -17,25 +17,24 @@ from numpy import ndarray as Array
 
 from qsim.figures import new_figure, write_figure
 from qsim.files import load_array, replacing
-from quiver.data.clips import Clip
-from quiver.data.codes import Codes
+from quiver.data.codes import Codes, CodeTruth
 from quiver.evaluation import metrics
 
-EDGES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)  # px/frame
+EDGES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)  # px per code
 CROP = 96  # px, at most
 SCENES_SHOWN = 6  # rows of a sheet
 
 
 def bin_names() -> list[str]:
-    """Return `0-0.5`, ..., `8 and more`, in px/frame."""
+    """Return `0-0.5`, ..., `8 and more`, in px per code."""
     return [f"{low:g} and more" if math.isinf(high) else f"{low:g}-{high:g}" for low, high in pairwise(EDGES)]
 
 
-def speeds(clip: Clip, frames: range) -> Array | None:
-    """Return motion [T, H, W] in px/frame from the clip's own flow, NaN where it is not valid; None without flow."""
-    if not clip.has_truth:
+def speeds(truth: CodeTruth, codes: range) -> Array | None:
+    """Return motion [T, H, W] in px per code from the clip's own flow, NaN where it is not known; None without flow."""
+    if not truth.has_truth:
         return None
-    return np.stack([np.hypot(*clip.flow(t)) for t in frames])
+    return np.stack([np.hypot(*truth.flow(t)) for t in codes])
 
 
 def by_motion(matched: Array, target: Array, speed: Array) -> tuple[tuple[int, ...], tuple[float, ...]]:
@@ -65,11 +64,11 @@ def pooled(counts: Sequence[Sequence[int]], squares: Sequence[Sequence[float]]) 
 # Crops
 
 
-def place(clip: Clip, t: int) -> tuple[slice, slice]:
-    """Return the square of at most CROP px in frame t with most motion, in steps of 8 px; the middle without flow."""
-    height, width = clip.shape[1:]
+def place(truth: CodeTruth, t: int) -> tuple[slice, slice]:
+    """Return the square of at most CROP px in code t with most motion, in steps of 8 px; the middle without flow."""
+    height, width = truth.clip.shape[1:]
     side = min(CROP, height, width)
-    found = speeds(clip, range(t, t + 1))
+    found = speeds(truth, range(t, t + 1))
     if found is None:
         y = (height - side) // 2
         x = (width - side) // 2
@@ -93,16 +92,18 @@ def save_crop(path: Path, picture: Array) -> None:
         np.save(file, np.minimum(picture, 2).astype(np.float16))
 
 
-def keep_crops(out: Path, light: str, clip: Clip, codes: Codes, frames: range, stacks: Mapping[str, Array]) -> None:
+def keep_crops(
+    out: Path, light: str, truth: CodeTruth, codes: Codes, frames: range, stacks: Mapping[str, Array]
+) -> None:
     """Store the part of the middle frame with most motion, from each [T, H, W] stack and from the codes, under
     OUT/crops.
     """
     middle = len(frames) // 2
-    part = place(clip, frames[middle])
+    part = place(truth, frames[middle])
     pictures = {name: stack[middle][..., *part] for name, stack in stacks.items()}
     pictures["codes"] = codes.read(frames[middle], frames[middle] + 1)[0][part] / (codes.sensor.levels - 1)
     for name, picture in pictures.items():
-        save_crop(crop_file(out, light, clip.name, name), picture)
+        save_crop(crop_file(out, light, truth.clip.name, name), picture)
 
 
 def sheet(

@@ -24,8 +24,8 @@ from numpy import ndarray as Array
 from qsim import records
 from qsim.files import Blocked, read_json, write_json
 from quiver import threads
-from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
-from quiver.data.codes import Codes, Stream, array_codes, sensed, stored, windows_sensed
+from quiver.data.clips import Clip, open_clips, peak_of
+from quiver.data.codes import Codes, CodeTruth, Stream, array_codes, check_published, sensed, stored, windows_sensed
 from quiver.data.illumination import Illumination, file_digests, labels, read_sensor
 from quiver.device import PeakMemory
 from quiver.evaluation import breakdown, metrics
@@ -86,20 +86,21 @@ def clips_of(comparison: Comparison) -> list[Clip]:
     return [Clip.open(path) for path in sorted(Path(comparison.source).iterdir()) if (path / "clip.json").exists()]
 
 
-def truth_psnr(clip: Clip, factor: float, peak: float, frames: range) -> float | None:
-    """Return the PSNR [dB] of the clip's own truth at a peak in photons, from its measured errors; None without them.
+def truth_psnr(truth: CodeTruth, peak: float, codes: range) -> float | None:
+    """Return the PSNR [dB] of the truth of codes at a peak in photons, from its measured errors; None without them.
 
     It is a lower bound. Errors that were measured clamped at white apply to peaks up to 2.5 times the mean light. At
     another peak an unclamped error counts as if all of it lay below the peak.
     Errors are measured in radiance, to which photons are proportional.
     """
+    clip = truth.clip
     errors = clip.info.error_per_frame
     if not errors or clip.mean_radiance <= 0:
         return None
-    if peak <= peak_of(mean_light(clip, factor), None) * (1 + 1e-6):
+    if peak <= peak_of(truth.mean_light, None) * (1 + 1e-6):
         errors = clip.info.error_at_white_per_frame or errors
-    unit = mean_light(clip, factor) / clip.mean_radiance / peak
-    return metrics.truth_psnr([errors[t] * unit for t in frames])
+    unit = truth.mean_light / clip.mean_radiance / peak
+    return metrics.truth_psnr([errors[truth.exposures.middle_frame(t)] * unit for t in codes])
 
 
 def score_video(video: Array, stream: Stream, *, peak: float | None = None) -> metrics.Score:
@@ -118,16 +119,16 @@ def score_video(video: Array, stream: Stream, *, peak: float | None = None) -> m
     return metrics.score(np.asarray(video) / np.float32(white), target / white, valid=stream.known())
 
 
-def peak_in_photons(comparison: Comparison, clip: Clip, codes: Codes, factor: float) -> float:
+def peak_in_photons(comparison: Comparison, codes: Codes, truth: CodeTruth) -> float:
     """Return the peak of a clip's scores: as set, else 2.5 times the mean light, or as published the white.
 
     Of the paper's test sets it is the light of grey 255.
     """
     if comparison.test_set is not None:
-        return factor
+        return truth.factor
     if comparison.peak is None and comparison.published:
         return codes.white
-    return peak_of(mean_light(clip, factor), comparison.peak)
+    return peak_of(truth.mean_light, comparison.peak)
 
 
 def restore_clip(
@@ -136,10 +137,10 @@ def restore_clip(
     light: Illumination,
     comparison: Comparison,
     codes: Codes,
-    factor: float,
+    truth: CodeTruth,
     out: Path | None = None,
 ) -> ComparisonRow:
-    """Restore and score one clip, and store a crop of its middle frame under OUT.
+    """Restore and score one clip, and store a crop of its middle code under OUT.
 
     A failure becomes the reason in the row.
     """
@@ -147,10 +148,10 @@ def restore_clip(
     precision, cut = settings_of(method, codes)
     row = ComparisonRow(method.name, method.description, name, clip.name, scene_of(clip), precision=precision, cut=cut)
     row = replace(row, device=method.device, threads=threads.current())
-    frames = scored_frames(len(clip), comparison.published)
-    white = peak_in_photons(comparison, clip, codes, factor)
-    target = truth(clip, factor, frames.start, frames.stop) / white
-    valid = known(clip, frames.start, frames.stop)
+    frames = scored_frames(len(truth), comparison.published)
+    white = peak_in_photons(comparison, codes, truth)
+    target = truth.video(frames.start, frames.stop) / white
+    valid = truth.known(frames.start, frames.stop)
     windows = list(windows_sensed(clip, light, comparison.seed, frames)) if comparison.published else []
     memory = PeakMemory(method.device)
     started = time.perf_counter()
@@ -168,20 +169,20 @@ def restore_clip(
     except Exception as error:  # a method's failure is recorded as its result
         return replace(row, failure=f"{type(error).__name__}: {' '.join(str(error).split())}")
     matched = restored * (factors / unit).astype(np.float32).reshape(-1, *(1,) * (restored.ndim - 1))
-    speed = breakdown.speeds(clip, frames)
+    speed = breakdown.speeds(truth, frames)
     if speed is not None and valid is not None:
         speed = np.where(valid, speed, math.nan)
     pixels, squares = ((), ()) if speed is None else breakdown.by_motion(matched, target, speed)
     if out is not None:
         shown = replace(codes, read=_middles(windows, frames)) if windows else codes
-        breakdown.keep_crops(out, row.light, clip, shown, frames, {row.crop: matched, "truth": target})
+        breakdown.keep_crops(out, row.light, truth, shown, frames, {row.crop: matched, "truth": target})
     return replace(
         row,
         score=score,
         seconds_per_frame=seconds,
         peak_bytes=peak,
         peak=white,
-        truth_psnr=truth_psnr(clip, factor, white, frames),
+        truth_psnr=truth_psnr(truth, white, frames),
         motion_pixels=pixels,
         motion_squares=squares,
     )
@@ -215,12 +216,13 @@ def check(comparison: Comparison) -> list[Clip]:
             clip.require_one_band("the published protocol")
         if not scored_frames(len(clip), comparison.published):
             raise ValueError(f"clip {clip.name}: {len(clip)} frames are too few; published windows have 11")
-    for light in comparison.lights:
-        if comparison.published and light.sensor.endswith(".toml") and read_sensor(light.sensor, light.bits)[1]:
+    for light in comparison.lights if comparison.published else ():
+        check_published(light)
+        if light.sensor.endswith(".toml") and read_sensor(light.sensor, light.bits)[1]:
             raise ValueError(
                 f"published=True: draws windows without defects, and {light.sensor} has a table [defects]; leave it out"
             )
-        if comparison.published and light.draw(clips[0]).remembers:
+        if light.draw(clips[0]).remembers:
             raise ValueError(
                 f"published=True: draws windows one by one, and the charge of a spike camera ({light.sensor}) stays "
                 "between them; leave it out"
@@ -244,7 +246,7 @@ def evaluate(
     total = len(comparison.lights) * len(clips) * len(methods)
     for light in comparison.lights:
         for clip in clips:
-            drawn, factor = (
+            drawn, truth = (
                 sensed(clip, light, comparison.seed) if comparison.stream is None else stored(clip, comparison.stream)
             )
             label = comparison.label(light)
@@ -256,7 +258,7 @@ def evaluate(
                     progress(f"{method.name}, {clip.name}, {label}", len(rows), total)
                 if key not in known:
                     codes = codes or in_memory(drawn)
-                    known[key] = restore_clip(method, clip, light, comparison, codes, factor, out)
+                    known[key] = restore_clip(method, clip, light, comparison, codes, truth, out)
                     if out is not None:
                         append(out / "rows.jsonl", known[key])
                 rows.append(known[key])

@@ -19,7 +19,7 @@ import numpy as np
 from qsim import records
 from qsim.files import VERSION, Progress, to_json
 from qsim.locks import Lock
-from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
+from quiver.data.clips import Clip, open_clips, peak_of
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination, file_digests
 from quiver.evaluation import metrics
@@ -167,7 +167,8 @@ def measure_cell(network: Restorer, methods: Sequence[Restorer], settings: Domai
     best = int(np.nanargmax(others))
     clip = settings.clips[0]
     assert light.ppp is not None
-    place = place_of(light.device(clip.exposure), clip.exposure, light.ppp)
+    exposure = clip.exposure * light.planes
+    place = place_of(light.device(exposure), exposure, light.ppp)
     return Cell(Path(light.sensor).name, light.ppp, place, round(own, 3), methods[best].name, round(others[best], 3))
 
 
@@ -183,8 +184,7 @@ def _mean_score(method: Restorer, settings: DomainSettings, light: Illumination)
 
 def score(method: Restorer, clip: Clip, light: Illumination, seed: int) -> float:
     """Return the matched PSNR [dB] of one clip restored by one method."""
-    drawn, factor = sensed(clip, light, seed)
-    peak = peak_of(mean_light(clip, factor))
+    drawn, truth = sensed(clip, light, seed)
+    peak = peak_of(truth.mean_light)
     restored = method.restore(in_memory(drawn))
-    target = truth(clip, factor, 0, len(clip)) / peak
-    return metrics.score(restored / peak, target, valid=known(clip, 0, len(clip))).psnr_matched
+    return metrics.score(restored / peak, truth.video() / peak, valid=truth.known()).psnr_matched

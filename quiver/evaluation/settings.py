@@ -13,7 +13,15 @@ from quiver.restoration.settings import method_names
 
 # What a test of the paper decides: these settings cannot be given beside it.
 PROTOCOLS: dict[str, dict[str, Any]] = {
-    name: {"split": None, "stream": None, "sensor": "quiver-published", "bits": (3,), "peak": None, "published": True}
+    name: {
+        "split": None,
+        "stream": None,
+        "sensor": "quiver-published",
+        "bits": (3,),
+        "planes": None,
+        "peak": None,
+        "published": True,
+    }
     for name in ("quiver-published", "x4k1000fps")
 }
 

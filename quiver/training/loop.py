@@ -29,6 +29,7 @@ from qsim.keys import Key
 from qsim.terminal import Tolerant
 from quiver import threads
 from quiver.data.clips import clips_digest, split_clips, unfinished
+from quiver.data.illumination import OTHERS
 from quiver.data.stream_windows import StreamWindows
 from quiver.data.windows import Batches, Windows, WindowSettings
 from quiver.device import is_gpu, moved
@@ -79,6 +80,9 @@ def make_windows(
     )
     training, validation = split_clips(settings.data, settings.validation_split)
     windows = Windows(training, window, prepare=system.prepare)
+    for noise in windows.noise.noises:
+        if noise.sensing.exposures is not None:
+            raise ValueError(f"{noise.sensor}: networks do not know exposures that take turns; {OTHERS}")
     if not validation:
         names = ", ".join(settings.folders)
         split = settings.validation_split

@@ -11,7 +11,7 @@ import numpy as np
 
 from qsim import records
 from qsim.files import Blocked, Damaged, read_json
-from qsim.kinds import Bits, Count, Light, Number, Positive, Seed, Split, Text, Whole
+from qsim.kinds import Bits, Count, Frames, Light, Number, Positive, Seed, Split, Text, Whole
 from qsim.settings import setting
 from qsim.words import positive_numbers
 from quiver import threads
@@ -85,10 +85,17 @@ class Settings:
         tuple[Bits, ...] | None,
         setting("bits per code; several: 1,3", unset="the protocol's, else those of the streams"),
     ] = None
+    planes: Annotated[
+        Frames | None,
+        setting(
+            "clip frames of a code: planes that a clocked SPAD sums, slices of one exposure of other sensors",
+            unset="those of the streams, else 1",
+        ),
+    ] = None
     temperature: Annotated[
         Number | None, setting("degrees C of sensor files with dark_doubling", unit="degrees C", unset="the files' own")
     ] = None
-    noise: tuple[Illumination, ...] | None = None  # follows from these three, set by `settled`; every window draws one
+    noise: tuple[Illumination, ...] | None = None  # follows from these five, set by `settled`; every window draws one
     crop: Annotated[Whole, setting("px, side of the training windows", unset="the protocol's")] = 64
     frames: Annotated[
         Whole, setting("frames of a training window", unset="the protocol's, mostly 11; of 16, QUIVER restores six")
@@ -152,7 +159,9 @@ class Settings:
         if self.noise is not None:
             return self.noise
         return tuple(
-            Illumination.of(sensor, ppp, bits, temperature=self.temperature)
+            Illumination.of(sensor, ppp, bits, temperature=self.temperature).over(
+                self.planes, bits if self.bits else None
+            )
             for sensor in self.sensors or ("quiver-physical",)
             for bits in self.bits or (3,)
             for ppp in self.ppp or (3.25,)
@@ -183,7 +192,7 @@ PROTOCOLS: dict[str, dict[str, Any]] = {
     | {"sensor": "quiver-paper", "learning_rate": 2.5e-5, "batch": 4, "loss": "paper", "steps": 94_500},
     "spad-sum": {"sensor": "spad-320x240", "ppp": (4.9,), "bits": (3,)},
 }
-_ASKED = ("sensor", "ppp", "bits", "temperature")
+_ASKED = ("sensor", "ppp", "bits", "planes", "temperature")
 
 
 def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[str]]:
@@ -195,7 +204,7 @@ def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[
     if settings.noise is not None:
         return settings, Mixture(settings.noise).lines
     clips = open_clips(settings.data, "train")
-    mixture = choose(clips, settings.sensors, settings.ppp, settings.bits, settings.temperature)
+    mixture = choose(clips, settings.sensors, settings.ppp, settings.bits, settings.temperature, settings.planes)
     path = Path(settings.out) / "settings.json"
     if force or not path.is_file():
         return replace(settings, noise=mixture.noises), mixture.lines

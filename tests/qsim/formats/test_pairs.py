@@ -57,15 +57,22 @@ def test_flow_is_that_of_the_clip_and_unknown_where_points_hide(tmp_path: Path):
     assert np.isnan(flow[4]).all(), "the last frame has no next one"
 
 
-def test_sums_of_frames_and_clips_without_truth_have_no_flow(tmp_path: Path):
+def test_flow_of_sums_leads_from_code_to_code_and_clips_without_truth_have_none(tmp_path: Path):
     clip = square_clip(tmp_path / "c", frames=6)
     clip.sense(BinarySPAD(0.4, 1.0, 2), ppp=3.0, group=True)
     write_clip(tmp_path / "e", frames=3).sense("quiver-paper", ppp=2.0)
+    found = {}
     for name in ("c", "e"):
         assert main(["convert", str(tmp_path / name), str(tmp_path / f"{name}.h5"), "--window", "2", "-q"]) == 0
         with h5py.File(tmp_path / f"{name}.h5", "r") as file:
-            assert np.isnan(file["all/flow"][...]).all()
+            found[name] = file["all/flow"][...]
             assert file["all/codes"].shape[:2] == (1, 2)
+    assert np.isnan(found["e"]).all()
+    expected = np.zeros((2, 24, 33), np.float32)
+    expected[0, 6:12, 5:11] = 3.0  # the square of the middle plane, three planes later
+    expected[0, 6:12, 11:13] = [2.0, 1.0]  # what it runs over, and this clip calls valid, goes along from there
+    np.testing.assert_array_equal(found["c"][0, 0], expected)
+    assert np.isnan(found["c"][0, 1]).all(), "the last code has no next one"
 
 
 @pytest.mark.parametrize(

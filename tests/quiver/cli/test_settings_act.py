@@ -154,6 +154,7 @@ SITUATIONS = (
     Situation(CLIP, names, only=("output",)),
     Situation(TRAIN.replace("--steps 2", "--minutes 1e-7"), history, only=("validate_every",)),
     Situation(f"{TRAIN} --sensor warm.toml --ppp 3", tensors, only=("temperature",)),
+    Situation(TRAIN.replace("data", "lasting"), tensors, {"planes": "2"}, only=("planes",)),
     Situation(RESUMED, tensors),
     Situation(f"{TRAIN} --sensor spad.toml --ppp 3", tensors, {"bits": "2"}),
     replaces(f"{RESUMED} --seed 1"),
@@ -208,6 +209,7 @@ SITUATIONS = (
     Situation(BENCH_CLASSICAL, costs, {"methods": "naive"}, only=("methods", "size")),
     Situation(ABLATE.replace(" --mode streaming", ""), scores, {"mode": "streaming"}, only=("mode",)),
     Situation(f"{ABLATE} --sensor warm.toml --ppp 3", tensors, only=("temperature",)),
+    Situation(ABLATE.replace("data", "lasting"), tensors, {"planes": "2"}, only=("planes",)),
     Situation(BENCH, costs, only=("device",)),
     Situation(BENCH.replace(" --modes streaming", ""), costs, only=("modes",)),
     Situation(BENCH_UNET, costs),
@@ -357,6 +359,7 @@ def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_dataset(folder / "data", {"train": 2, "val": 1, "test": 1}, **size)
     write_dataset(folder / "lone", {"train": 1}, **size)
     write_dataset(folder / "wide", {"train": 1, "val": 1, "test": 1}, frames=12, height=16, width=100)
+    write_dataset(folder / "lasting", {"train": 1, "val": 1, "test": 1}, frames=22, height=16, width=24)
     for name, streams in (("clip", ()), ("one", (1,)), ("two", (1, 3))):
         clip = write_clip(folder / name, **size)
         for ppp in streams:

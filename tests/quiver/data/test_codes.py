@@ -16,7 +16,7 @@ from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.streams.sensing import Sensing
 from qsim.streams.storing import sense
-from quiver.data.clips import open_clips, truth
+from quiver.data.clips import open_clips
 from quiver.data.codes import array_codes, frame_reader, light_of, sensed
 from quiver.data.illumination import Illumination
 from quiver.data.windows import as_input
@@ -35,10 +35,10 @@ SENSORS = (
 def test_sensed_codes_and_truth(make_clip: ClipMaker):
     """Drawn frame by frame or at once, the codes are the same; the truth has the requested light level."""
     clip = make_clip()
-    codes, factor = sensed(clip, Illumination(), seed=2)
+    codes, truth = sensed(clip, Illumination(), seed=2)
     whole = codes.read(0, 14)
     np.testing.assert_array_equal(np.concatenate([codes.read(t, t + 1) for t in range(14)]), whole)
-    assert truth(clip, factor, 0, 14).mean() == pytest.approx(3.25, rel=1e-6)
+    assert truth.video().mean() == pytest.approx(3.25, rel=1e-6)
     assert codes.white == pytest.approx(8.75)
     assert (sensed(clip, Illumination(), seed=3)[0].read(0, 1) != whole[:1]).any()
 

@@ -11,6 +11,7 @@ import pytest
 from clips import ClipMaker
 from sensor_files import COUNTER, QIS, sensor_file
 
+from qsim.sensor.counting import CountingSPAD
 from qsim.streams.photons import clip_photons, light_level
 from qsim.streams.sensing import Sensing
 from qsim.streams.storing import sense
@@ -102,13 +103,32 @@ def test_what_windows_cannot_have_is_refused(make_clip: ClipMaker, tmp_path):
     counter = sensor_file(tmp_path, COUNTER + "carry_dead_time = true\n", 3)
     with pytest.raises(ValueError, match=r"carry_dead_time and afterpulse of counting pixels.*without them"):
         Windows([make_clip()], WindowSettings(crop=16, lights=(Illumination.of(counter, 3.0, 3),)))
+    followed = make_clip("followed")
+    sense(followed, Sensing("spad-320x240", bits=2, ppp=3.0, row_delay=1e-6, name="r"))
+    assert "row_delay 1e-06" in choose([followed]).lines[0]
+    sense(followed, Sensing(CountingSPAD(0.4, 10.0, 1e-6, 3), ppp=3.0, follow=True, name="f"))
+    assert len(choose([followed]).noises) == 2  # of one clip frame the closed form is exact
+
+
+def test_codes_of_several_clip_frames_stay_such_codes(make_clip: ClipMaker, tmp_path):
+    """Another sensor, depth or light changes no code's time: trained on clip frames, motion was too slow."""
     sums = make_clip("sums")
     sense(sums, Sensing("spad-320x240", bits=2, ppp=3.0, group=True))
-    with pytest.raises(ValueError, match=r"one full exposure .* this has codes of 3 clip frames; give sensor="):
-        choose([sums])
-    assert choose([sums], ["spad-320x240"], [1.0], [2]).lines[0].startswith("noise: spad-320x240, 2 bits, 1 PPP")
-    own = sensor_file(tmp_path, QIS, 4)
-    assert choose([sums], [own], [1.0]).lines[0].startswith("noise: mine, 4 bits, 1 PPP")  # a file states its bits
+    file = sensor_file(tmp_path, QIS, 4)
+    said = {
+        "noise: spad-320x240, 2 bits, 3 PPP, 3 planes": choose([sums]),
+        "noise: spad-320x240, 2 bits, 1 PPP, 3 planes (as asked for)": choose([sums], None, [1.0]),
+        "noise: spad512s, 3 bits, 1 PPP, 7 planes (as asked for)": choose([sums], ["spad512s"], [1.0], [3]),
+        "noise: mine, 4 bits, 1 PPP, 3 slices (as asked for)": choose([sums], [file], [1.0]),
+        "noise: spad512s, 4 bits, 3 PPP, 15 planes (as asked for)": choose([sums], ["spad512s"], planes=15),
+        "noise: spad-320x240, 3 bits, 3 PPP, 7 planes (as asked for)": choose([sums], planes=7),
+        "noise: spad-320x240, 2 bits, 3 PPP (as asked for)": choose([sums], planes=1),
+    }
+    assert [found.lines[0] for found in said.values()] == list(said)
+    with pytest.raises(ValueError, match=r"planes: a sum of 7 planes has 3 bits, and 2 are asked for"):
+        choose([sums], ["spad512s"], None, [2], planes=7)
+    with pytest.raises(ValueError, match=r"planes: a b-bit code sums 2\^b - 1 planes, got 5; give 3 or 7"):
+        choose([sums], planes=5)
 
 
 def test_every_window_is_normalised_by_its_own_sensor(make_clip: ClipMaker):

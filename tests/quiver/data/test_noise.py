@@ -15,6 +15,7 @@ from clips import ClipMaker
 from sensor_files import QIS, sensor_file
 
 from qsim.settings import settings_of
+from qsim.streams.exposures import Timing
 from qsim.streams.preparation import prepare
 from qsim.streams.sensing import Sensing
 from qsim.streams.storing import sense
@@ -108,27 +109,17 @@ def test_settings_act_in_windows_as_in_sensing(make_clip: ClipMaker, tmp_path, s
 
 def test_every_other_setting_is_refused(make_clip: ClipMaker):
     """A setting that is new is refused until windows honour it."""
-    others = {
-        "seed": 3,
-        "name": "x",
-        "group": True,
-        "slices": 2,
-        "row_delay": 1e-6,
-        "row_order": "up",
-        "colour": "rggb",
-        "exposures": (1.0, 0.5),
-        "light_drift": 0.2,
-        "follow": True,
-    }
+    others = {"seed": 3, "name": "x", "colour": "rggb", "follow": True}
     assert {setting.name for setting in settings_of(Sensing)} == {*others, *HONOURED}
     clip = make_clip()
     for name, value in others.items():
-        more = {"row_delay": 1e-6} if name == "row_order" else {}
-        light = Illumination.of(**{name: value} | more)
-        with pytest.raises(ValueError, match=f"quiver-physical: a training window has one full .* has .*{name}"):
+        light = Illumination.of(**{name: value})
+        with pytest.raises(ValueError, match=f"quiver-physical: training windows cannot have .*{name}; give sensor="):
             Windows([clip], WindowSettings((light,), crop=16))
-    info = SimpleNamespace(planes_per_code=1, settings={"seed": 3, "diffraction": True, "colour": "rggb", "later": 1})
-    assert unlike_windows(SimpleNamespace(info=info, rows=None, shares=None)) == ["colour", "later"]
+    settings = {"seed": 3, "diffraction": True, "colour": "rggb", "later": 1}
+    info = SimpleNamespace(planes_per_code=3, settings=settings, sensing=Sensing("spad512s"), bits=3)
+    unlike = ["colour", "later", "codes of 3 clip frames that its settings do not state"]
+    assert unlike_windows(SimpleNamespace(info=info, timing=Timing(3, summed=True))) == unlike
 
 
 # Runs

@@ -267,7 +267,7 @@ def test_bad_radiance_names_its_clip(make_clip: ClipMaker, monkeypatch):
     monkeypatch.setattr(type(clip), "radiance", lambda self, t, crop=None: np.full((36, 44), np.nan, np.float32))
     with pytest.raises(ValueError, match=r"sliding_0: frames 2\.\.3: photons"):
         sensed(clip, Illumination())[0].read(2, 4)
-    with pytest.raises(ValueError, match=r"sliding_0: window from frame \d: photons"):
+    with pytest.raises(ValueError, match=r"sliding_0: window from code \d: photons"):
         Windows([clip], WindowSettings(crop=36))[0]
 
 

@@ -14,8 +14,9 @@ from methods import method
 from numpy import ndarray as Array
 
 from qsim.files import load_array
+from qsim.streams.code_truth import CodeTruth
+from qsim.streams.exposures import Timing
 from quiver.cli.evaluate import OURS
-from quiver.data.clips import truth
 from quiver.data.codes import Codes, sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import breakdown, metrics, summary
@@ -65,7 +66,7 @@ def test_windows_with_a_factor_each_are_matched_by_their_own(make_clip: ClipMake
     """An exact answer that flickers, in published windows: after the factor of each no error is left, nor in crops."""
     clip = make_clip(flow=np.full((2, 36, 44), 1.0, np.float32))
     comparison = Comparison(str(clip.path), None, (Illumination.of("quiver-published"),), published=True)
-    exact = truth(clip, sensed(clip, comparison.lights[0])[1], 0, len(clip))
+    exact = sensed(clip, comparison.lights[0])[1].video()
 
     def restore(codes: Codes) -> Array:
         t = int(codes.name.rpartition(" ")[2])
@@ -115,14 +116,14 @@ def test_crops_show_where_most_moves(make_clip: ClipMaker, tmp_path):
     flow = np.zeros((2, 120, 150), np.float32)
     flow[0, 90:110, 100:140] = 3.0
     clip = make_clip(frames=3, height=120, width=150, flow=flow)
-    rows, columns = breakdown.place(clip, 1)
+    rows, columns = breakdown.place(CodeTruth(clip, Timing()), 1)
     assert (rows.stop - rows.start, columns.stop - columns.start) == (96, 96)
     assert rows.start <= 90
     assert rows.stop >= 110
     assert columns.start <= 100
     assert columns.stop >= 140
     still = make_clip("still", frames=3, height=120, width=40)
-    assert breakdown.place(still, 1) == (slice(40, 80), slice(0, 40))
+    assert breakdown.place(CodeTruth(still, Timing()), 1) == (slice(40, 80), slice(0, 40))
     assert not breakdown.sheet(tmp_path, "3.25 PPP", [clip.name], ["moment"], {}, tmp_path / "none.png")
     breakdown.save_crop(breakdown.crop_file(tmp_path, "3.25 PPP", clip.name, "truth"), np.zeros((8, 8)))
     lost = {(clip.name, "moment"): "moment 01234567"}

@@ -19,10 +19,12 @@ from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
 from qsim.optics.radiometry import RGB
 from qsim.streams.clip import Clip
+from qsim.streams.code_truth import CodeTruth
+from qsim.streams.exposures import Timing
 from qsim.streams.sensing import Sensing
 from qsim.streams.storing import sense
 from quiver.cli.program import main
-from quiver.data.clips import known, open_clips, truth
+from quiver.data.clips import open_clips
 from quiver.data.codes import Codes, sensed, stream_codes
 from quiver.data.illumination import Illumination
 from quiver.evaluation import breakdown, metrics, summary
@@ -47,7 +49,7 @@ def oracle(source: Path, factor: float = 1.0) -> Restorer:
 
     def restore(codes: Codes) -> Array:
         clip = known[codes.name.split(",")[0]]
-        return factor * truth(clip, sensed(clip, Illumination())[1], 0, len(clip))
+        return factor * sensed(clip, Illumination())[1].video()
 
     return method(f"oracle {factor:g}", restore)
 
@@ -62,7 +64,7 @@ def test_a_known_truth_scores_what_it_should(tiny_dataset):
     assert perfect.psnr > 120
     assert dark.psnr_matched > 120
     clip = open_clips(tiny_dataset, "test")[0]
-    x = truth(clip, sensed(clip, Illumination())[1], 0, 14) / 8.125
+    x = sensed(clip, Illumination())[1].video() / 8.125
     assert x.max() < 1
     expected = np.mean([-20 * math.log10(0.1 * math.sqrt(np.mean(frame**2))) for frame in x])
     assert dark.psnr == pytest.approx(expected, abs=1e-3)
@@ -224,18 +226,19 @@ def test_a_failure_keeps_its_row_and_reason(tiny_dataset, tmp_path):
 def test_truth_psnr_is_the_radiance_error_in_units_of_white(make_clip: ClipMaker):
     """Relative clip, mean 1 by construction of the factor: rms 0.01 of radiance is 0.01 * 3.25 / mean of 8.125."""
     clip = make_clip(relative=True, error=0.01)
-    _, factor = sensed(clip, Illumination())
+    _, truth = sensed(clip, Illumination())
     light = sliding_pattern(len(clip), *clip.shape[1:], 0)
     rounded = [np.sqrt(np.mean((light[t] - clip.radiance(t)) ** 2)) for t in range(4)]  # to half floats, 2e-4
     error = math.sqrt(0.01**2 + np.mean(np.square(rounded)))
     expected = -20 * math.log10(error * (3.25 / clip.mean_radiance) / 8.125)
-    assert truth_psnr(clip, factor, 8.125, range(4)) == pytest.approx(expected)
-    assert truth_psnr(make_clip("unknown", error=None), 1.0, 8.125, range(4)) is None
+    assert truth_psnr(truth, 8.125, range(4)) == pytest.approx(expected)
+    assert truth_psnr(replace(truth, clip=make_clip("unknown", error=None)), 8.125, range(4)) is None
     # Measured clamped at white, it counts up to 2.5 x the mean light; a higher peak takes the unclamped one.
-    halved = replace(clip, info=replace(clip.info, error_at_white_per_frame=[0.005] * len(clip)))
+    info = replace(clip.info, error_at_white_per_frame=[0.005] * len(clip))
+    halved = replace(truth, clip=replace(clip, info=info))
     half = -20 * math.log10(0.005 * (3.25 / clip.mean_radiance) / 8.125)
-    assert truth_psnr(halved, factor, 8.125, range(4)) == pytest.approx(half)
-    assert truth_psnr(halved, factor, 16.25, range(4)) == truth_psnr(clip, factor, 16.25, range(4))
+    assert truth_psnr(halved, 8.125, range(4)) == pytest.approx(half)
+    assert truth_psnr(halved, 16.25, range(4)) == truth_psnr(truth, 16.25, range(4))
 
 
 def bright_clip(make_clip: ClipMaker, share: float, **options: object):
@@ -295,7 +298,7 @@ def test_saturated_pixels_count_nowhere(tmp_path):
         for t in range(12):
             writer.add(t, rng.uniform(0.5, 1.5, (24, 30)), saturated=mask)
     clip = open_clips(tmp_path / "recorded")[0]
-    exact = truth(clip, sensed(clip, Illumination())[1], 0, 12)
+    exact = sensed(clip, Illumination())[1].video()
     noise = rng.normal(0, 1, exact.shape)
     spoilt = method("spoilt", lambda codes: exact + 0.1 * noise + np.where(mask, 5.0, 0.0))
     rows = evaluate(Comparison(str(clip.path), None), [spoilt, method("whole", lambda codes: exact + 0.1 * noise)])
@@ -347,7 +350,7 @@ def test_published_crops_show_the_codes_that_methods_saw(make_clip: ClipMaker, t
     row = evaluate(Comparison(str(clip.path), None, published=True), [method("look", look)], out)[0]
     assert row.failure is None
     frames = scored_frames(len(clip), True)
-    wanted = seen[len(frames) // 2][breakdown.place(clip, frames[len(frames) // 2])] / 7
+    wanted = seen[len(frames) // 2][breakdown.place(CodeTruth(clip, Timing()), frames[len(frames) // 2])] / 7
     stored = files.load_array(breakdown.crop_file(out, row.light, clip.name, "codes"))
     np.testing.assert_array_equal(stored, wanted.astype(np.float16))
 
@@ -483,7 +486,7 @@ def test_the_spread_of_factors_is_over_clips(tiny_dataset):
     def restore(codes: Codes) -> Array:
         clip = known[codes.name.split(",")[0]]
         at = sorted(known).index(clip.name)
-        return truth(clip, sensed(clip, Illumination())[1], 0, len(clip)) / (0.7 + 0.1 * at)
+        return sensed(clip, Illumination())[1].video() / (0.7 + 0.1 * at)
 
     rows = evaluate(Comparison(str(tiny_dataset)), [method("off", restore)])
     factors = [row.score.scale for row in rows]
@@ -517,5 +520,4 @@ def test_a_colour_clip_with_saturated_pixels_is_scored(tmp_path):
     clip = Clip.open(tmp_path / "c")
     assert clip.info.saturated_pixels > 0
     stream = clip.sense("quiver-physical", ppp=3.25, bits=3, colour="rggb", name="s")
-    assert known(clip, 0, 3) is None
     assert stream.known() is None

@@ -12,7 +12,6 @@ import pytest
 from clips import ClipMaker
 from methods import method
 
-from quiver.data.clips import truth
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import summary
@@ -95,7 +94,7 @@ def test_scores_near_the_truth_are_marked(make_clip: ClipMaker):
 
     def wrong(psnr: float) -> Restorer:
         sigma = 2.5 * 3.25 * 10 ** (-psnr / 20)
-        exact = truth(clip, sensed(clip, Illumination())[1], 0, len(clip))
+        exact = sensed(clip, Illumination())[1].video()
         return method(f"at {psnr:g}", lambda codes: exact + rng.normal(0, sigma, exact.shape))
 
     comparison, methods = Comparison(str(clip.path), None), [wrong(36.0), wrong(20.0)]

@@ -12,7 +12,6 @@ from random_codes import EXPOSURE, SENSOR, random_codes
 
 from qsim.restored_video import Restored
 from quiver.baselines import METHODS
-from quiver.data.clips import truth
 from quiver.data.codes import Codes, sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
@@ -58,8 +57,8 @@ def test_methods_of_one_table_have_names_of_their_own(tmp_path):
 def test_the_shipped_weights_are_useful_at_once(make_clip: ClipMaker):
     """A pattern that no training saw, 1.5 px/frame: measured 9.3 dB above the best window mean; 5 dB must be there."""
     clip = make_clip(frames=15, height=64, width=72)
-    codes, factor = sensed(clip, Illumination())
-    target = truth(clip, factor, 0, len(clip)) / codes.white
+    codes, truth = sensed(clip, Illumination())
+    target = truth.video() / codes.white
 
     def psnr(name: str) -> float:
         return metrics.score(restorer(name).restore(codes) / codes.white, target).psnr_matched
