@@ -62,10 +62,11 @@ def restore(asked: RestoreSettings, sums: PlaneSums, options: RestoreOptions, li
         note(line)
     length, height, width = codes.shape
     size = f"{height} x {width}" + ("" if codes.colour is None else " in R, G, B")
+    found = f"; {codes.scan}" if codes.scan else ""
     output(
         {"restored": str(target)} | records.plain(info, complete=True),
         f"{target}: {length} frames of {size} by {method.name}, {codes.rates}, "
-        f"{info.seconds_per_frame:.3g} s per frame; photons, white of the sensor = {codes.white:.4g}",
+        f"{info.seconds_per_frame:.3g} s per frame; photons, white of the sensor = {codes.white:.4g}{found}",
     )
     return 0
 
@@ -78,7 +79,7 @@ def _restore_cubes(asked: RestoreSettings, sums: PlaneSums, options: RestoreOpti
     from quiver.restoration.submission import check_target, restore_cubes
 
     target: Path = asked.output
-    idle = ("stream", "sensor", "ppp", "bits", "seed", "width", "frame_rate", "defects")
+    idle = ("stream", "sensor", "ppp", "bits", "seed", "width", "frame_rate", "defects", "scan")
     refuse(asked, idle, f"{target} is a submission, whose layout states it")
     refuse(sums, ("start", "stop", "every"), "the challenge scores the last plane of all that a cube has")
     check_target(target, asked.force)

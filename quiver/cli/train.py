@@ -68,6 +68,10 @@ def train(asked: Train, given: Annotated[dict[str, Any], Settings]) -> int:
     settings = settings_of_run(asked.protocol, given | ({} if first is None else {"start": digest(first)}))
     if settings.network.startswith("bit2bit"):
         settings = _of_stream(given, settings)
+    elif "scan" in given:
+        raise ArgumentError(
+            "scan", "acts on a recording that a network learns from; the defects of drawn codes are known; leave it out"
+        )
     if "validate_every" in given and settings.steps is None:
         raise ValueError(
             "--validate-every: counts steps of a run with --steps; a run that --minutes ends is validated "
@@ -134,7 +138,10 @@ def _of_stream(given: Mapping[str, Any], settings: Settings) -> Settings:
             raise ArgumentError(name, f"{why}; leave it out")
     if len(settings.folders) > 1:
         raise ValueError(f"{', '.join(settings.folders)}: {settings.network} learns from one stream; give one")
-    return own_light(settings, stream_at(Path(settings.folders[0])))
+    codes = stream_at(Path(settings.folders[0]), settings.scan)
+    if codes.scan:
+        note(f"{codes.name}: {codes.scan}")
+    return own_light(settings, codes)
 
 
 def network_of(settings: Settings, first: Path | None = None) -> Any:
@@ -149,7 +156,7 @@ def network_of(settings: Settings, first: Path | None = None) -> Any:
 
     network = build(settings.network)
     if isinstance(network, Bit2Bit):
-        network = Bit2Bit(config_for(stream_at(Path(settings.folders[0])), network.config))
+        network = Bit2Bit(config_for(stream_at(Path(settings.folders[0]), settings.scan), network.config))
     if first is None:
         return network
     loaded = weights.load(first)

@@ -91,6 +91,8 @@ class Codes:
     not_inverted: str = ""  # defects that add detections, which the sensor's response leaves out: crosstalk, afterpulse
     sums: Sums | None = None  # of a recording's planes; None: its frames are taken as they are
     times: Times | None = None  # of the codes; None: not known
+    unmapped: bool = False  # a recording whose hot pixels nothing states: they are looked for (hot_pixels.py)
+    scan: str = ""  # what was found, in words
     unfilled: Codes | None = field(default=None, compare=False, repr=False)  # the same without filled pixels
 
     @property
@@ -155,7 +157,8 @@ def filled(codes: Codes, bad: Array | None) -> Codes:
         before = codes.digest()
         return before and hashlib.sha256(before.encode() + np.packbits(marked).tobytes()).hexdigest()
 
-    return replace(codes, read=read, digest=digest, defective=marked, unfilled=codes.unfilled or codes)
+    unfilled = codes.unfilled or codes
+    return replace(codes, read=read, digest=digest, defective=marked, unmapped=False, unfilled=unfilled)
 
 
 def summed(codes: Codes, asked: PlaneSums) -> Codes:
@@ -355,8 +358,10 @@ def codes_of(stream: Stream) -> Codes:
     """
     codes = stream_codes(stream)
     table = stream.info.defects
-    if not table or stream.info.light is not None:
+    if stream.info.light is not None:
         return codes
+    if not table:
+        return replace(codes, unmapped=True)
     try:
         return repaired(codes, defects.read_defects(table))
     except (OSError, ValueError) as error:

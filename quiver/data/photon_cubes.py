@@ -36,7 +36,7 @@ def cube_codes(
             codes = array_codes(array, sensor, 1 / frame_rate, path.name, str(path))
         else:
             codes = _unpacked(path, array, sensor, frame_rate, width)
-    codes = replace(codes, digest=lambda: array_digest(array), sensor_name=light.sensor)
+    codes = replace(codes, digest=lambda: array_digest(array), sensor_name=light.sensor, unmapped=True)
     return summed(codes, sums)
 
 

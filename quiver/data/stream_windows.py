@@ -15,6 +15,7 @@ from torch.utils.data import Dataset
 from qsim.keys import Key
 from qsim.streams.clip import Clip
 from quiver.data.codes import Codes, codes_of, light_of, open_stream, stream_codes
+from quiver.data.hot_pixels import scanned
 from quiver.data.window_noise import WindowPlace
 from quiver.data.windows import WindowSettings, as_input, turned
 
@@ -74,18 +75,21 @@ def _no_counts(codes: Codes) -> str | None:
     return None
 
 
-def stream_at(path: Path) -> Codes:
-    """Return the codes of a stored stream, or of the only stream of a clip folder. `ValueError` for other paths."""
+def stream_at(path: Path, scan: bool | None = None) -> Codes:
+    """Return the codes of a stored stream, or of the only stream of a clip folder. `ValueError` for other paths.
+
+    Hot pixels of a recording without a map are filled (hot_pixels.py), unless `scan` is False.
+    """
     if path.is_dir():
         clip = Clip.open(path)
         if len(clip.streams) != 1:
             raise ValueError(
                 f"{path}: has the streams {', '.join(clip.streams) or 'none'}; name one of their .npy files"
             )
-        return stream_codes(clip.stream(clip.streams[0]))
+        return scanned(stream_codes(clip.stream(clip.streams[0])), scan)
     if not path.with_suffix(".json").is_file():
         raise FileNotFoundError(f"{path}: no stored stream, which is a .npy with its .json; see `qsim sense`")
-    return codes_of(open_stream(path))
+    return scanned(codes_of(open_stream(path)), scan)
 
 
 class StreamWindows(Dataset[dict[str, Any]]):
@@ -108,7 +112,7 @@ class StreamWindows(Dataset[dict[str, Any]]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how a worker makes the same windows: it opens the stored stream again."""
-        return _opened, (self.codes.source, self.settings)
+        return _opened, (self.codes.source, self.settings, False if self.codes.unmapped else None)
 
     def __len__(self) -> int:
         """Return how many windows hold as many codes as the stream; numbers beyond are windows, too."""
@@ -132,6 +136,6 @@ class StreamWindows(Dataset[dict[str, Any]]):
         return {"codes": as_input(turned(part, place), self.codes.sensor), "sample": n, "key": key}
 
 
-def _opened(path: str, settings: WindowSettings) -> StreamWindows:
+def _opened(path: str, settings: WindowSettings, scan: bool | None) -> StreamWindows:
     """Return the windows of a stored stream."""
-    return StreamWindows(stream_at(Path(path)), settings)
+    return StreamWindows(stream_at(Path(path), scan), settings)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from quiver.data.codes import (
     summed,
 )
 from quiver.data.defects import check_map
+from quiver.data.hot_pixels import scanned
 from quiver.data.illumination import Illumination, is_known
 from quiver.restoration.automatic import chosen
 from quiver.restoration.interface import AUTO, DEFAULT_METHOD, RestoreOptions, refuse_outside, remarks
@@ -45,6 +47,7 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     strict: bool = False,
     defects: Array | None = None,
     planes: int | PlaneSums | None = None,
+    scan: bool | None = None,
 ) -> Array:
     """Return restored video, float32 [T, H, W], in photons per pixel and exposure (expected, before quantum
     efficiency). Of a stream behind colour filters it is [T, 3, H, W]: the photons of R, G and B.
@@ -58,8 +61,9 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     are filled from their neighbours, as are those that a stream's description states; crosstalk and afterpulses, which
     are not inverted, warn. A network outside of what it was measured for warns; with `strict` it is a `ValueError`.
     `planes` sums so many successive frames of one bit to a code; with `exposure` that of one plane, the photons are
-    those of the sum. `qsim.PlaneSums` states which planes, too. `ValueError` or `FileNotFoundError` where the arguments
-    do not fit together.
+    those of the sum. `qsim.PlaneSums` states which planes, too. Of arrays and imported streams without a map, hot
+    pixels are looked for, filled and told by a warning; `scan=False` leaves them. `ValueError` or `FileNotFoundError`
+    where the arguments do not fit together.
 
         video = quiver.restore(stream)
     """
@@ -68,7 +72,8 @@ def restore(  # noqa: PLR0913 (settings of a public function)
         raise ValueError(f"method= is a name, a weights file or a run folder as text, got {method!r}")
     bad = None if defects is None else check_map(np.asarray(defects), "defects=")
     sums = planes if isinstance(planes, PlaneSums) else PlaneSums(planes=planes)
-    codes = filled(summed(_codes(source, sensor, exposure, ppp), sums), bad)
+    codes = summed(_codes(source, sensor, exposure, ppp), sums)
+    codes = scanned(codes, scan) if bad is None else filled(codes, bad)
     runner, _ = chosen(method, codes, RestoreOptions(device=device or "auto", mode=mode or "exact"))
     refuse_idle({"device": device, "mode": mode, "method": method}, [runner])
     found = remarks([runner], codes)
@@ -76,6 +81,8 @@ def restore(  # noqa: PLR0913 (settings of a public function)
         refuse_outside([runner], found, "strict=", named=method != AUTO)
     if codes.not_inverted:
         found.append(f"{codes.name}: {codes.not_inverted} not inverted, restored light is too bright")
+    if codes.scan and codes.defective is not None:
+        found.append(f"{codes.name}: {codes.scan}, and filled; leave them with scan=False")
     for text in found:
         warnings.warn(text, stacklevel=2)
     restored = runner.restore(codes)
@@ -127,4 +134,4 @@ def _array(codes: Array, sensor: Sensor | None, exposure: float | None) -> Codes
         raise ValueError(f"sensor= is a sensor, as qsim.load_sensor(NAME, ...) returns it, got {sensor!r}")
     if not 0 < exposure < float("inf"):
         raise ValueError(f"exposure= is in seconds and above 0, got {exposure!r}")
-    return array_codes(codes, sensor, exposure)
+    return replace(array_codes(codes, sensor, exposure), unmapped=True)

@@ -137,6 +137,7 @@ def _described(codes: Codes, method: Restorer) -> VideoInfo:
         codes_sha256=codes.digest(),
         colour={} if codes.colour is None else codes.colour.to_dict() | by_places,
         not_inverted=codes.not_inverted,
+        scan=codes.scan,
     )
 
 

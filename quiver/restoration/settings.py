@@ -9,6 +9,7 @@ from typing import Annotated
 
 from qsim.kinds import Bits, Light, Positive, Seed, Text, Whole
 from qsim.settings import setting
+from quiver.data.hot_pixels import Wanted
 from quiver.data.illumination import sensor_names
 from quiver.restoration.interface import DEFAULT_METHOD
 
@@ -63,5 +64,6 @@ class RestoreSettings:
     defects: Annotated[
         Path | None, setting("map of defective pixels, .npy [H, W], true where hot or dead: they are filled")
     ] = None
+    scan: Wanted = None
     strict: Annotated[bool, setting("networks: refuse a stream outside their measured domain")] = False
     force: Annotated[bool, setting("replace an existing result")] = False

@@ -16,6 +16,7 @@ from qsim.streams.plane_sums import AS_STORED, PlaneSums
 from quiver.data.clips import Clip, open_clips
 from quiver.data.codes import Codes, codes_of, filled, light_of, open_stream, repaired, sensed, stream_codes, summed
 from quiver.data.defects import read_map
+from quiver.data.hot_pixels import scanned
 from quiver.data.illumination import Illumination, colour_filter, follows_light
 from quiver.data.photon_cubes import cube_codes
 from quiver.restoration.interface import AUTO
@@ -34,7 +35,7 @@ def refuse(asked: Any, names: Sequence[str], why: str) -> None:
     """Raise `ArgumentError` with the first of these settings that is given, and the reason why it has no effect."""
     for name in names:
         value = getattr(asked, name)
-        if value is not None and value is not False:  # 0 is a given value
+        if value is not None and (value is not False or name == "scan"):  # 0 is a given value
             raise ArgumentError(name, f"{why}; leave it out")
 
 
@@ -62,11 +63,14 @@ def codes_to_restore(asked: RestoreSettings, sums: PlaneSums = AS_STORED) -> Cod
     """Return the codes of `quiver restore`: a stored stream, a clip that is sensed now, or a bare array.
 
     Planes are summed as asked. Pixels that the map `defects` or the sensor's file marks are filled
-    (quiver/data/defects.py).
+    (quiver/data/defects.py); without a map, those that a scan finds (quiver/data/hot_pixels.py).
     """
     codes = _found(asked, sums)
     check_bands(codes)
-    return codes if asked.defects is None else filled(codes, read_map(asked.defects))
+    if asked.defects is None:
+        return scanned(codes, asked.scan)
+    refuse(asked, ["scan"], "the map of defective pixels is given")
+    return filled(codes, read_map(asked.defects))
 
 
 def _found(asked: RestoreSettings, sums: PlaneSums) -> Codes:
@@ -139,6 +143,7 @@ def assumed(codes: Codes, method: Restorer) -> str:
     if codes.colour is not None:
         rows, columns = codes.colour.tile
         light += f", each of {rows} x {columns} places of the colour filters alone, then demosaiced"
+    light += f", {codes.scan}" if codes.scan else ""
     light += f", {bad} of {height * width} pixels defective and filled from their neighbours" if bad else ""
     light += f", {codes.not_inverted} not inverted (restored light is too bright)" if codes.not_inverted else ""
     seen = f"{method.frames_used} frames" if method.seamless else f"all earlier and {method.look_ahead} later frames"

@@ -40,7 +40,7 @@ def make_stream_windows(settings: Settings) -> StreamWindows:
     window = WindowSettings(
         frames=settings.frames, crop=settings.crop, flips=settings.flips, reverse=settings.reverse, seed=settings.seed
     )
-    return StreamWindows(stream_at(Path(settings.folders[0])), window)
+    return StreamWindows(stream_at(Path(settings.folders[0]), settings.scan), window)
 
 
 def split_loss(network: Any, batch: Batch, settings: Settings, share: float) -> Tensor:

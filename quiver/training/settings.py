@@ -16,6 +16,7 @@ from qsim.settings import setting
 from qsim.words import positive_numbers
 from quiver import threads
 from quiver.data.clips import open_clips
+from quiver.data.hot_pixels import Wanted
 from quiver.data.illumination import Illumination, sensor_names
 from quiver.data.mixture import Mixture, choose, describe
 from quiver.model.names import NETWORKS
@@ -126,6 +127,7 @@ class Settings:
     validation_split: Annotated[Split, setting("split to validate on")] = "val"
     validation_windows: Whole = 16  # at most
     workers: Annotated[Count, setting("processes that draw samples", unset="0: this one")] = 0
+    scan: Wanted = None
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"],
         setting("precision", unset="auto: bfloat16 on CUDA; published protocols: float32"),

@@ -1,0 +1,279 @@
+"""Finds hot pixels in a recording without a map: pixels that do not follow their neighbours over the whole clip.
+
+    codes of up to 16 times  ->  light of each pixel, beside the median of its eight neighbours  ->  map [H, W]
+
+A hot pixel adds its dark counts to whatever passes by. A bright point of the scene does one of three things: it leaves
+the pixel, it takes part in what changes around it (a shadow, a lamp that flickers), or nothing changes around it. So a
+pixel is **proven** hot if all of this holds:
+
+* over the clip it is brighter than its neighbours, by far more than they are than theirs;
+* it is so at every time;
+* the light changed on all four sides of it, other than that of the whole frame, and differently on opposite sides;
+* its light is not a constant multiple of its neighbours'.
+
+Where nothing moves, and in little light, no pixel is proven alone. There the bright single pixels of the moving part
+decide together. If there are enough of them, hardly any leaves its place, and as one they do not follow their
+neighbours, they are taken as hot. So are those where nothing moves, unless they are far more than this share explains.
+Of a still frame nothing is ever marked: a star stays.
+
+Dead pixels are not looked for: a map has them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from numpy import ndarray as Array
+from scipy.ndimage import correlate1d, uniform_filter, uniform_filter1d
+from scipy.stats import chi2
+
+from qsim.checks import ArgumentError
+from qsim.settings import setting
+from quiver.data.codes import Codes, filled
+
+Wanted = Annotated[
+    bool | None,
+    setting("recordings: look for hot pixels, which are filled", unset="where no map states them", option="scan"),
+]
+TIMES = 16  # at which a clip is looked at
+FRAMES = 16  # that are averaged at each of them, at most
+FEWEST = 6  # times, below which nothing is told
+OUTLIER = 5.0  # deviations of the neighbours' own excess, beyond which a pixel stands out
+CONSTANT = 0.35  # of its mean, which the excess of a hot pixel has at every time
+CHANGED = 1e-4  # chance that still light seems to change on a side
+ENOUGH = 5  # bright single pixels in moving parts, from which they decide together
+MOSTLY = 0.8  # of the far brighter pixels there that are so at every time, likewise
+TOGETHER = 0.5  # of the changes of light around them that they follow, at most, likewise
+MANY = 3.0  # of what their share explains where nothing moves: more than this are points of the scene
+SURE = 3.0  # deviations
+LEAST = 1e-3  # variance of a code [codes^2], at least
+SLACK = 1.25  # on the part of a change that light in common explains
+SIDES = ((3, 2), (7, 4))  # px, width and depth of what is compared on each side of a pixel
+AROUND = 9  # px, side of the square of neighbours whose excess is the measure
+
+
+@dataclass(frozen=True)
+class Scan:
+    """The hot pixels of a recording."""
+
+    hot: Array  # bool [H, W]
+    proven: int  # of them by their own codes; the others stand out where nothing moves
+    moving: float  # share of the frame where light moved
+
+    def words(self) -> str:
+        """Return what was found, as text."""
+        found = int(self.hot.sum())
+        if not found:
+            return f"no hot pixel found by the scan ({100 * self.moving:.0f} % of the frame moved)"
+        rest = found - self.proven
+        alike = f", {rest} like them where nothing moves" if rest else ""
+        return f"{found} hot pixels found by the scan ({self.proven} do not follow their neighbours{alike})"
+
+
+def scanned(codes: Codes, wanted: bool | None = None) -> Codes:
+    """Return the codes of a recording with the hot pixels filled that a scan finds; the same where a map states them.
+
+    `ArgumentError` if it is `wanted` or unwanted where there is nothing to look for.
+    """
+    if not codes.unmapped:
+        if wanted is not None:
+            raise ArgumentError(
+                "scan",
+                f"acts on recordings without a map of hot pixels, and those of {codes.name} are known; leave it out",
+            )
+        return codes
+    if wanted is False:
+        return codes
+    found = scan(codes)
+    return replace(filled(codes, found.hot), scan=found.words())
+
+
+def scan(codes: Codes) -> Scan:
+    """Return the hot pixels that the codes of a stream prove; none of a clip that is too short.
+
+    Behind colour filters each place of the mask is compared with its own colour.
+    """
+    length, height, width = codes.shape
+    nothing = Scan(np.zeros((height, width), bool), 0, 0.0)
+    times = min(TIMES, length)
+    rows, columns = (1, 1) if codes.colour is None else codes.colour.tile
+    if times < FEWEST or min(height // rows, width // columns) < AROUND or codes.shares is not None:
+        return nothing
+    each = min(FRAMES, length // times)
+    starts = np.linspace(0, length - each, times).round().astype(int)
+    means = np.stack([codes.read(int(t), int(t) + each).mean(axis=0) for t in starts]).astype(np.float32)
+    try:
+        response = codes.sensor.response(codes.exposure)
+    except ValueError:  # codes that do not determine light
+        return nothing
+    hot = np.zeros((height, width), bool)
+    proven = np.zeros((height, width), bool)
+    moving = np.zeros((height, width), bool)
+    for i in range(rows):
+        for j in range(columns):
+            place = (slice(i, None, rows), slice(j, None, columns))
+            seen = _Seen.of(means[:, *place], response.mean, response.variance, each)
+            proven[place] = seen.proven
+            hot[place] = seen.hot
+            moving[place] = seen.moving
+    return Scan(hot, int(proven.sum()), float(moving.mean()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What the mean codes of several times tell about the pixels of one colour."""
+
+    stands_out: Array  # bool [H, W]: on the whole, far brighter than its neighbours
+    bright: Array  # bool [H, W]: so at every time
+    moving: Array  # bool [H, W]: the light around it moves
+    apart: Array  # bool [H, W]: does not follow its neighbours
+    followed: Array  # [3, H, W]: changes that it shares with its neighbours; those of its neighbours; noise in them
+
+    @classmethod
+    def of(cls, means: Array, mean_code: Array, variance: Array, frames: int) -> _Seen:
+        """Return what mean codes [K, H, W] of `frames` codes each tell, by the variances of a code at a mean code."""
+        ring = _ring(means)
+        least = LEAST / frames
+        typical = np.maximum(uniform_filter(means.mean(axis=0), 3, mode="reflect"), ring)  # of few counts a median errs
+        noise = np.interp(typical, mean_code, variance) / frames + least
+        own = np.interp(means.mean(axis=0), mean_code, variance) / frames + least
+        beside = np.pi / 16 * noise  # of a median of eight
+        excess = means - ring
+        mean_excess = excess.mean(axis=0)
+        shot = (noise + beside).mean(axis=0) / len(means)
+        spread = np.sqrt(_robust_square(mean_excess) + shot)
+        stands_out = mean_excess > OUTLIER * spread
+        dark_enough = ring < 0.85 * mean_code[-1]  # beside saturated neighbours no excess is left
+        low = excess < CONSTANT * mean_excess - 3 * np.sqrt(own + beside)
+        bright = stands_out & ~(low & dark_enough).any(axis=0)
+        return cls(
+            stands_out,
+            bright,
+            _moving(means, ring, own),
+            ~_follows(means, ring, own, beside),
+            _shared(means, ring, own, beside),
+        )
+
+    @property
+    def proven(self) -> Array:
+        """Pixels that are hot by their own codes, bool [H, W]."""
+        return self.bright & self.moving & self.apart
+
+    @property
+    def hot(self) -> Array:
+        """Pixels that are hot, bool [H, W]: the proven ones, and others if their share explains these."""
+        proven = self.proven
+        candidates = self.bright & self.moving
+        count = int(candidates.sum())
+        left = int((self.stands_out & self.moving & ~self.bright).sum())  # bright points of the scene
+        if count < ENOUGH or count < MOSTLY * (count + left) or not self._apart_together(candidates):
+            return proven
+        still = int((self.bright & ~self.moving).sum())
+        expected = count / int(self.moving.sum()) * int((~self.moving).sum())
+        if still > MANY * expected + SURE * np.sqrt(max(expected, 1.0)):
+            return candidates
+        return self.bright
+
+    def _apart_together(self, candidates: Array) -> bool:
+        """Return whether some pixels, taken together, surely follow less than TOGETHER of what changes around them."""
+        shared, around, noise = self.followed[:, candidates].sum(axis=1)
+        changes = around - noise
+        if changes < SURE * noise * np.sqrt(2 / (int(candidates.sum()) * (TIMES - 1))):
+            return False
+        return bool(shared + SURE * np.sqrt(around) < TOGETHER * changes)
+
+
+def _ring(means: Array) -> Array:
+    """Return the median of the eight neighbours of every pixel, [K, H, W]; the frame is reflected at its edge."""
+    padded = np.pad(means, ((0, 0), (1, 1), (1, 1)), mode="reflect")
+    height, width = means.shape[1:]
+    near = [
+        padded[:, 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+        for dy in (-1, 0, 1)
+        for dx in (-1, 0, 1)
+        if (dy, dx) != (0, 0)
+    ]
+    return np.asarray(np.median(np.stack(near), axis=0))
+
+
+def _robust_square(values: Array) -> Array:
+    """Return the mean square [H, W] of the values of a square around each pixel, which single large ones do not move.
+
+    Values are cut at three times their typical size in the frame's neighbourhood, in two rounds.
+    """
+    size = np.abs(values)
+    limit = 3 * np.maximum(uniform_filter(np.minimum(size, 3 * np.median(size) + 1e-9), AROUND, mode="reflect"), 1e-9)
+    for _ in range(2):
+        square = uniform_filter(np.minimum(size, limit) ** 2, AROUND, mode="reflect")
+        limit = 3 * np.sqrt(square) + 1e-9
+    return np.asarray(square)
+
+
+def _moving(means: Array, ring: Array, own: Array) -> Array:
+    """Return where light moves across a pixel, bool [H, W]: it changes on all sides, and differently on opposite ones.
+
+    A change of the whole frame, as at dusk, and one that all neighbours share, as a shadow, are no motion. Sides are
+    narrow, or in little light wide.
+    """
+    whole = np.broadcast_to(np.median(ring, axis=(1, 2))[:, None, None], ring.shape)
+    found = [_crossed(means, ring, own, whole, *size) for size in SIDES]
+    return np.asarray(np.logical_or.reduce(found))
+
+
+def _crossed(means: Array, ring: Array, own: Array, whole: Array, width: int, depth: int) -> Array:
+    """Return the same by sides of `width` x `depth` pixels."""
+    degrees = len(means) - 2
+    sides = {side: _side(means, *side, width, depth) for side in ((-1, 0), (1, 0), (0, -1), (0, 1))}
+    noise = {side: _side(own[None], *side, width, depth)[0] / (width * depth) for side in sides}
+    changed = [_left(values, whole, noise[side], least=1.0) for side, values in sides.items()]
+    across = [
+        _left(sides[one] - sides[other], ring, noise[one] + noise[other])
+        for one, other in (((-1, 0), (1, 0)), ((0, -1), (0, 1)))
+    ]
+    different = np.maximum(*across) > chi2.isf(CHANGED / 2, degrees)
+    return np.asarray(different & (np.minimum.reduce(changed) > chi2.isf(CHANGED, degrees)))
+
+
+def _side(means: Array, dy: int, dx: int, width: int, depth: int) -> Array:
+    """Return the mean of the pixels on one side of every pixel, `depth` rows of `width`, [K, H, W]."""
+    along, away = (2, 1) if dy else (1, 2)
+    rows = np.zeros(2 * depth + 1)
+    rows[slice(0, depth) if dy + dx < 0 else slice(depth + 1, None)] = 1 / depth
+    mean = uniform_filter1d(means, width, axis=along, mode="reflect")
+    return np.asarray(correlate1d(mean, rows, axis=away, mode="reflect"))
+
+
+def _left(values: Array, law: Array, variance: Array, least: float = 0.0) -> Array:
+    """Return chi-square [H, W] of values [K, H, W] about their best fit a + b law.
+
+    b is at most what light that all share explains: as much in proportion as the law, or `least`, with a margin.
+    """
+    middle = values.mean(axis=0)
+    x = law - law.mean(axis=0)
+    y = values - middle
+    most = SLACK * np.maximum(np.abs(middle) / np.maximum(law.mean(axis=0), 1e-6), least)
+    slope = np.clip((x * y).sum(axis=0) / np.maximum((x**2).sum(axis=0), 1e-12), -most, most)
+    return np.asarray(((y - slope * x) ** 2 / variance).sum(axis=0))
+
+
+def _follows(means: Array, ring: Array, own: Array, beside: Array) -> Array:
+    """Return where the light of a pixel may be a constant multiple of that of its neighbours, bool [H, W]."""
+    ratio = (means * ring).sum(axis=0) / np.maximum((ring**2).sum(axis=0), 1e-12)
+    left = ((means - ratio * ring) ** 2 / (own + ratio**2 * beside)).sum(axis=0)
+    return np.asarray(left < chi2.isf(CHANGED, len(means) - 1))
+
+
+def _shared(means: Array, ring: Array, own: Array, beside: Array) -> Array:
+    """Return what each pixel has of the changes of its neighbours' light, in units of its noise, [3, H, W].
+
+    They are the sums over time of change times change, of the neighbours' change squared, and of the noise in that.
+    Neighbours are scaled to the light of the pixel.
+    """
+    ratio = means.mean(axis=0) / np.maximum(ring.mean(axis=0), 1e-6)
+    expected = ratio * (ring - ring.mean(axis=0))
+    change = means - means.mean(axis=0)
+    shared = (change * expected).sum(axis=0)
+    noise = (1 - 1 / len(means)) * (ratio**2 * beside).sum(axis=0)
+    return np.stack([shared, (expected**2).sum(axis=0), noise]) / own
