@@ -150,7 +150,7 @@ class Commands:
         """An option as typed, with a value that is not its default."""
         given = f"--{setting.option}"
         if is_flag(setting):
-            return given
+            return self.words.get(f"{situation.command}.{setting.name}", given)
         for words, key in (
             (situation.words, setting.name),
             (self.words, f"{situation.command}.{setting.name}"),

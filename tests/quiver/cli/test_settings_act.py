@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import spad_camera
 import torch
 from acting import Bench, Commands, Run, Situation, check_json, check_printing, exit_code, names, stdout
 from clips import write_clip, write_dataset
@@ -168,6 +169,7 @@ SITUATIONS = (
     Situation(BARE.replace("quiver-paper", "spad.toml"), words={"bits": "2"}),
     Situation(CUBE, words={"bits": "2"}),
     needs(CUBE.replace("--width 24 ", ""), "width", width="24"),
+    Situation("restore hot.npy --sensor spad-320x240 --bits 3 -o r.npy --method moment", only=("scan",)),
     Situation(ZIP),
     Situation(NET),
     Situation(NET.replace("--mode streaming ", ""), words={"mode": "streaming"}, only=("mode",)),
@@ -252,6 +254,8 @@ COMMANDS = Commands(
         "steps": "3",
         "protocol": "spad-sum",
         "restore.output": "s.npy",
+        "restore.scan": "--no-scan",
+        "train.scan": "--no-scan",
         "sensor": "quiver-published",
         "size": "24x16",
         "split": "val",
@@ -272,11 +276,12 @@ COMMANDS = Commands(
         "memory": seen("read"),
         "workers": seen("workers"),
     },
-    may_be_silent=frozenset({"threads", "force", "memory", "workers", "strict"}),
+    may_be_silent=frozenset({"scan", "threads", "force", "memory", "workers", "strict"}),
     prepared=frozenset({"validate_every", "validation_split", "minutes"}),
     never_here={
         **{f"{command}.device": "no other device is here" for command in COMPUTING},
         "domain.memory": "its streams are short",
+        "train.scan": "its presets learn from data sets; tests/quiver/data/test_hot_pixels.py",
         "ablate.memory": "its clips are small",
         "evaluate.protocol": "its data sets are large; tests/quiver/data/test_test_sets.py",
     },
@@ -367,6 +372,9 @@ def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_clip(folder / "short", frames=5, height=16, width=24)
     write_clip(folder / "large", frames=11, height=88, width=88)
     np.save(folder / "codes.npy", rng.integers(0, 2, (12, 16, 24)).astype(np.uint8))
+    moved = spad_camera.panned(spad_camera.texture(96, 5), (48, 48), 0.5)
+    taken = spad_camera.Camera(spad_camera.hot_map((48, 48), 0.02, 1)[1]).codes(moved, 4.0, 64, 7, 3)
+    np.save(folder / "hot.npy", taken)
     np.save(folder / "planes.npy", rng.integers(0, 256, (24, 16, 3)).astype(np.uint8))
     np.save(folder / "bad.npy", rng.random((16, 24)) < 0.1)
     np.save(folder / "small.npy", np.ones((8, 8), bool))

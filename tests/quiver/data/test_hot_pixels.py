@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +13,13 @@ from numpy import ndarray as Array
 
 import quiver
 from qsim import BinarySPAD
+from qsim.formats import importing
+from qsim.formats.recording import Hints
 from quiver.cli.program import main
 from quiver.data.codes import Codes, array_codes
 from quiver.data.hot_pixels import scan
+from quiver.data.stream_windows import StreamWindows, stream_at
+from quiver.data.windows import WindowSettings
 
 SHAPE = (48, 64)
 PLANES = 7
@@ -116,6 +122,20 @@ def test_a_recording_without_a_map_is_scanned(recording, capsys):
     np.testing.assert_array_equal(video, np.load("a.npy"))
     plain = quiver.restore(np.load("capture.npy"), "moment:1", sensor=sensor, exposure=1e-3, scan=False)
     np.testing.assert_array_equal(plain, np.load("b.npy"))
+
+
+def test_a_network_learns_from_filled_codes(recording):
+    """The windows of bit2bit, also in a worker, which opens the recording again."""
+    importing.to_stream(
+        importing.read("capture.npy", Hints(layout="codes", bits=3)), Path("own"), importing.Import(1000.0)
+    )
+    window = WindowSettings(frames=11, crop=48)
+    filled, plain = (StreamWindows(stream_at(Path("own.npy"), scan), window) for scan in (None, False))
+    assert "hot pixels found" in filled.codes.scan
+    for windows in (filled, plain):
+        again = pickle.loads(pickle.dumps(windows))
+        np.testing.assert_array_equal(again[0]["codes"], windows[0]["codes"])
+    assert not np.array_equal(filled[0]["codes"], plain[0]["codes"])
 
 
 def test_clips_too_short_tell_nothing():
