@@ -15,6 +15,7 @@ from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.clip_info import RELATIVE
 from qsim.clip.film import Film, card
 from qsim.files import Progress
+from qsim.keys import hash_name
 from qsim.kinds import Text
 from qsim.sensor.sensor import Sensor
 from qsim.settings import taking
@@ -83,7 +84,17 @@ class Clip(ClipFolder):
         if not path.is_file():
             known = ", ".join(self.streams) or "none yet; make one with `qsim sense`"
             raise FileNotFoundError(f"{self.path}: no stream {name!r}; there are: {known}")
-        return replace(Stream.open(path), keeps=self.keeps)
+        found = replace(Stream.open(path), keeps=self.keeps)
+        self._check_drawn_here(found)
+        return found
+
+    def _check_drawn_here(self, stream: Stream) -> None:
+        """Raise `ValueError` for a stream that was drawn from another clip: a folder of streams that was copied."""
+        if stream.info.clip_key not in (None, hash_name(self.name)):
+            raise ValueError(
+                f"{stream.path}: was drawn from the clip {stream.info.clip!r}, and this one is {self.name!r}; take it "
+                "away, and draw a stream here with `qsim sense`"
+            )
 
     def verify(self, progress: Progress | None = None) -> list[str]:
         """Return one message per file whose checksum or size differs; empty if the clip is intact.
@@ -100,7 +111,7 @@ class Clip(ClipFolder):
             report(done, total)
         for done, path in enumerate(streams, len(stored) + 1):
             try:
-                problems += Stream.open(path).verify()
+                problems += self.stream(path.stem).verify()
             except (ValueError, OSError) as error:
                 problems.append(files.wording(error))
             report(done, total)

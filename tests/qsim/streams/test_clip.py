@@ -1,5 +1,6 @@
 """Tests what a notebook does with clips and streams: sense, index, iterate, compare with the truth, show."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -160,3 +161,17 @@ def test_files_are_named_by_text_or_path(tmp_path: Path):
     assert np.array_equal(one.codes(), two.codes())
     description = one.path.with_suffix(".json")
     assert Stream.open(str(description)).info == Stream.open(description).info
+
+
+def test_a_stream_of_another_clip_is_not_of_this_one(tmp_path: Path):
+    """A copied folder of streams; another name of the clip's own folder changes nothing."""
+    first = write_clip(tmp_path / "a", frames=4, height=9, width=10)
+    second = write_clip(tmp_path / "b", frames=4, height=9, width=10)
+    first.sense("quiver-physical", ppp=3.25, bits=3, name="s")
+    shutil.copytree(first.path / "streams", second.path / "streams")
+    with pytest.raises(ValueError, match="was drawn from the clip 'a', and this one is 'b'"):
+        second.stream("s")
+    assert any("was drawn from the clip 'a'" in problem for problem in second.verify())
+    moved = Clip.open(first.path.rename(tmp_path / "moved"))
+    assert moved.stream("s").verify() == []
+    assert moved.verify() == []
