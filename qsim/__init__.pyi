@@ -7,6 +7,7 @@ from .dataset.scene_rendering import render as render
 from .keys import Key as Key
 from .optics.camera import Camera as Camera
 from .optics.radiometry import expected_photons as expected_photons
+from .plane_sums import PlaneSums as PlaneSums
 from .rendering.budget import Budget as Budget
 from .rendering.clip_rendering import render_clip as render_clip
 from .rendering.fidelity import choose_budget as choose_budget
@@ -22,7 +23,6 @@ from .sensor.sensor import Sensor as Sensor
 from .sensor.spad import BinarySPAD as BinarySPAD
 from .sensor.spike import SpikeCamera as SpikeCamera
 from .streams.clip import Clip as Clip
-from .streams.plane_sums import PlaneSums as PlaneSums
 from .streams.sensing import Sensing as Sensing
 from .streams.storing import replay as replay
 from .streams.storing import sense as sense

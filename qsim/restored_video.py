@@ -15,8 +15,8 @@ from numpy import ndarray as Array
 
 from qsim import descriptions, files, records
 from qsim.checks import check_video
-from qsim.clip.source import Times
 from qsim.files import Progress, load_array
+from qsim.frame_times import Times
 from qsim.kinds import Count, Digest, NotNegative, Positive, Text, Whole
 
 _CURE = "restore the video again"

@@ -26,11 +26,11 @@ from qsim.files import load_array
 from qsim.formats import importing, photon_times
 from qsim.formats.mat_files import mat_array
 from qsim.formats.recording import Hints
+from qsim.plane_sums import AS_STORED, PlaneRange, PlaneSums, Read, Sums
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
-from qsim.streams.plane_sums import AS_STORED, PlaneRange, PlaneSums, Read, Sums
 from qsim.streams.stream import Stream, is_stream
 
 _BLOCK_BYTES = 1 << 25

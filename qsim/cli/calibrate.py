@@ -10,8 +10,8 @@ from qsim.cli.command import Idle, command
 from qsim.cli.console import output, refuse_existing
 from qsim.formats.recording import Hints, Layout
 from qsim.kinds import Bits, Planes, Positive
+from qsim.plane_sums import PlaneRange
 from qsim.settings import setting
-from qsim.streams.plane_sums import PlaneRange
 
 COUNTS = 8  # bits; larger codes of a SPAD may be sums of planes, which the user must state
 

@@ -18,10 +18,10 @@ from qsim.formats import challenge, detection, exporting, importing, pairs
 from qsim.formats.recording import Hints, Recording
 from qsim.formats.summing import sum_planes
 from qsim.kinds import Positive, Split, Text, Whole
+from qsim.plane_sums import PlaneSums
 from qsim.restored_video import describes_restored
 from qsim.settings import setting, settings_of
 from qsim.streams.clip import Clip
-from qsim.streams.plane_sums import PlaneSums
 from qsim.streams.stream import Stream, is_stream
 
 PICTURES = ("mp4", "png", "nerfstudio")  # kinds that show light through a transfer curve

@@ -17,8 +17,8 @@ from qsim.cli.command import Idle, command
 from qsim.cli.console import bar, output, refuse_existing, running
 from qsim.clip.manifest import check_outside
 from qsim.kinds import Bits, Count, Frames, Text
+from qsim.plane_sums import PlaneSums
 from qsim.settings import setting
-from qsim.streams.plane_sums import PlaneSums
 from qsim.terminal import is_lost, printable
 
 PREVIEWS = (".mp4", ".gif", ".png")

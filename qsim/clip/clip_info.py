@@ -14,7 +14,8 @@ from typing import Annotated, Any, Final, Literal
 from msgspec import Meta
 
 from qsim import records
-from qsim.clip.source import Source, Times
+from qsim.clip.source import Source
+from qsim.frame_times import Times
 from qsim.kinds import Count, Digest, Name, NotNegative, Number, Positive, Split, Text, Whole, text_like
 from qsim.optics.camera import Camera
 

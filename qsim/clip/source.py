@@ -1,4 +1,4 @@
-"""Describes where light or codes were imported from: the recording, and the times of its frames."""
+"""Describes the recording that light or codes were imported from."""
 
 from __future__ import annotations
 
@@ -6,19 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from qsim import records
-from qsim.kinds import Count, Digest, NotNegative, Number, Positive, RowOrder, Text, Whole
+from qsim.kinds import Count, Digest, NotNegative, Number, Positive, RowOrder, Whole
 
 Flip = Literal["none", "lr", "ud", "both"]  # left and right, up and down
-
-
-@dataclass(frozen=True)
-class Times:
-    """When each frame was taken, as its source states it."""
-
-    values: tuple[Number, ...]  # rising
-    unit: Text  # s, or frames for numbers
-    source: Text  # what states them, in words
-    tick: NotNegative = 0.0  # to which they are rounded
 
 
 @dataclass(frozen=True, kw_only=True)

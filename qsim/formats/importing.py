@@ -22,13 +22,15 @@ from qsim.checks import file_path
 from qsim.clip import exr
 from qsim.clip.clip_info import ClipInfo, Saturation
 from qsim.clip.manifest import check_outside
-from qsim.clip.source import Source, Times
+from qsim.clip.source import Source
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
 from qsim.formats import gaps
 from qsim.formats.detection import ASSUMED, LAYOUTS, detect
 from qsim.formats.recording import Hints, Marked, Recording, reoriented, with_stated_layout
+from qsim.frame_times import Times
 from qsim.kinds import Split
+from qsim.plane_sums import AS_STORED, PlaneSums, Sums
 from qsim.sensor import colour_filter, devices, packing
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
@@ -36,7 +38,6 @@ from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 from qsim.streams.clip import Clip
-from qsim.streams.plane_sums import AS_STORED, PlaneSums, Sums
 from qsim.streams.stream import Stream, is_stream, write_packed
 from qsim.streams.stream_info import StreamInfo
 

@@ -16,8 +16,9 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
-from qsim.clip.source import Flip, Source, Times
+from qsim.clip.source import Flip, Source
 from qsim.colour import TRANSFERS, to_linear
+from qsim.frame_times import Times
 from qsim.kinds import Bits, Count, Positive, Text, Whole
 from qsim.settings import setting
 

@@ -13,8 +13,8 @@ from numpy import ndarray as Array
 from qsim.checks import ArgumentError
 from qsim.files import Progress
 from qsim.formats.importing import free_stream
+from qsim.plane_sums import PlaneSums
 from qsim.sensor import packing
-from qsim.streams.plane_sums import PlaneSums
 from qsim.streams.stream import Stream, write_packed
 from qsim.streams.stream_info import StreamInfo, StreamLight
 

@@ -23,11 +23,11 @@ from qsim.checks import check_shape, check_video
 from qsim.colour import bright_end
 from qsim.files import load_array
 from qsim.formats.recording import checked_codes
+from qsim.plane_sums import AS_STORED, PlaneSums
 from qsim.restored_video import Restored, RestoredInfo, describes_restored
 from qsim.sensor import packing
 from qsim.sensor.demosaicing import demosaic, determines_bands
 from qsim.streams.clip import Clip
-from qsim.streams.plane_sums import AS_STORED, PlaneSums
 from qsim.streams.stream import Stream
 
 Picture = NDArray[np.uint8]  # [H, W, 3]

@@ -26,12 +26,12 @@ from qsim.clip.film import Film, card
 from qsim.clip.lazy_array import LazyArray
 from qsim.files import VERSION, Progress
 from qsim.optics.radiometry import Crop, check_crop
+from qsim.plane_sums import Sums
 from qsim.sensor import packing
 from qsim.sensor.defects import defect_table, good_pixels
 from qsim.sensor.defects.defect_table import Defects
 from qsim.streams.code_truth import CodeTruth
 from qsim.streams.exposures import Timing
-from qsim.streams.plane_sums import Sums
 from qsim.streams.rows import Rows
 from qsim.streams.stream_info import StreamInfo
 

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any, Self
 
 from qsim import records
-from qsim.clip.source import Source, Times
+from qsim.clip.source import Source
 from qsim.files import VERSION
+from qsim.frame_times import Times
 from qsim.kinds import Bits, Count, Digest, NotNegative, Number, Positive, Text, Whole
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.defects.event_simulation import Effects

@@ -15,8 +15,8 @@ from qsim.cli.options import check_free
 from qsim.files import write_bytes, write_json
 from qsim.kinds import Light, Text
 from qsim.locks import Lock
+from qsim.plane_sums import PlaneSums
 from qsim.settings import setting
-from qsim.streams.plane_sums import PlaneSums
 from qsim.words import frame_size
 from quiver.cli.options import Threads, check_domain, given, renew, use_threads
 from quiver.device import DEVICES

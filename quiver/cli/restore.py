@@ -8,7 +8,7 @@ from pathlib import Path
 from qsim import records
 from qsim.cli.command import command
 from qsim.cli.console import RESUMES, bar, note, output
-from qsim.streams.plane_sums import PlaneSums
+from qsim.plane_sums import PlaneSums
 from quiver.cli.options import ResumedThreads, check_domain, given, use_threads
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.settings import RestoreSettings

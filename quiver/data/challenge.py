@@ -15,9 +15,9 @@ from numpy import ndarray as Array
 from qsim.arrays import plain
 from qsim.checks import ArgumentError
 from qsim.formats.challenge import COLOURS, DETECTIONS, Cube, cubes, picture
-from qsim.sensor.spad import BinarySPAD
-from qsim.streams.plane_sums import PlaneSums
+from qsim.plane_sums import PlaneSums
 from quiver.data.codes import Codes, summed
+from quiver.data.illumination import ideal_clocked
 
 __all__ = ["COLOURS", "Cube", "band_codes", "cubes", "light_of_band", "picture"]
 
@@ -40,7 +40,7 @@ def band_codes(cube: Cube, colour: int, planes: int) -> Codes:
     single = Codes(
         name=f"{cube.name} {COLOURS[colour]}",
         shape=(frames, height, width),
-        sensor=BinarySPAD(pde=1.0, dark_count_rate=0.0),
+        sensor=ideal_clocked(),
         exposure=1 / RATE,
         frame_rate=RATE,
         read=read,

@@ -22,9 +22,10 @@ from qsim import records
 from qsim.arrays import plain
 from qsim.checks import ArgumentError
 from qsim.clip.lazy_array import LazyArray
-from qsim.clip.source import Times
 from qsim.files import read_json, sha256, to_json, wording
+from qsim.frame_times import Times
 from qsim.keys import Key, hash_name
+from qsim.plane_sums import PlaneSums, Sums
 from qsim.restored_video import describes_restored
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.demosaicing import demosaic, determines_bands
@@ -33,7 +34,6 @@ from qsim.streams.clip import Clip
 from qsim.streams.code_truth import CodeTruth
 from qsim.streams.exposures import Timing
 from qsim.streams.photons import clip_photons
-from qsim.streams.plane_sums import PlaneSums, Sums
 from qsim.streams.preparation import followed
 from qsim.streams.storing import describe
 from qsim.streams.stream import Stream

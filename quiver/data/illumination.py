@@ -23,6 +23,7 @@ from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.file_laws import Conditions
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
+from qsim.sensor.spad import BinarySPAD
 from qsim.settings import given
 from qsim.streams.clip import Clip
 from qsim.streams.exposures import Timing
@@ -354,6 +355,11 @@ def is_known(sensor: Sensor) -> bool:
 def follows_light(sensor: str) -> bool:
     """Return whether the gain of a named sensor is set from the photons per pixel."""
     return sensor in devices.DEVICES and devices.DEVICES[sensor].follows_light
+
+
+def ideal_clocked(planes: int = 1) -> Sensor:
+    """Return a clocked SPAD that detects every photon and nothing else, whose codes sum so many planes."""
+    return BinarySPAD(pde=1.0, dark_count_rate=0.0).of_planes(planes)
 
 
 def ideal_counter(bits: int) -> Sensor:

@@ -12,11 +12,10 @@ from numpy import ndarray as Array
 from qsim.arrays import plain
 from qsim.checks import ArgumentError
 from qsim.files import decoding_errors, load_array, read_npy
-from qsim.sensor.spad import BinarySPAD
-from qsim.streams.plane_sums import PlaneSums, Sums
+from qsim.plane_sums import PlaneSums, Sums
 from qsim.streams.sensing import Sensing
 from quiver.data.codes import open_stream, stream_codes, summed
-from quiver.data.illumination import Illumination
+from quiver.data.illumination import Illumination, ideal_clocked
 from quiver.data.photon_cubes import cube_codes
 
 LARGEST = 1 << 32  # bytes of an array of counts in a .npz
@@ -61,7 +60,7 @@ def read_planes(path: Path, sums: PlaneSums, width: int | None) -> Counts:
         codes = summed(stream_codes(open_stream(path)), sums)
         rate = codes.frame_rate * (sums.every or sums.planes or 1)
     else:
-        codes = cube_codes(path, Illumination(Sensing(BinarySPAD(1.0, 0.0))), 1.0, sums=sums, width=width)
+        codes = cube_codes(path, Illumination(Sensing(ideal_clocked())), 1.0, sums=sums, width=width)
         rate = None
     if not codes.sensor.sums_planes:
         raise ValueError(f"{path}: holds codes of a {type(codes.sensor).__name__}, and planes are those of a SPAD")

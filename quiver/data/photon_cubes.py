@@ -10,9 +10,9 @@ from numpy import ndarray as Array
 
 from qsim.arrays import plain
 from qsim.files import load_array
+from qsim.plane_sums import AS_STORED, PlaneSums
 from qsim.sensor import devices
 from qsim.sensor.sensor import Sensor
-from qsim.streams.plane_sums import AS_STORED, PlaneSums
 from quiver.data.codes import Codes, array_codes, array_digest, summed
 from quiver.data.illumination import Illumination
 

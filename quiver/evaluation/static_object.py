@@ -17,11 +17,10 @@ from math import isnan, nan
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.sensor.spad import BinarySPAD
 from qsim.tables import markdown_table
 from quiver.data.clips import peak_of
 from quiver.data.codes import Codes, array_codes
-from quiver.data.illumination import ideal_counter
+from quiver.data.illumination import ideal_clocked, ideal_counter
 from quiver.data.photon_counts import Counts, arrivals
 from quiver.evaluation import metrics
 from quiver.restoration.interface import Restorer
@@ -61,7 +60,7 @@ def reference(counts: Counts, chosen: Array) -> tuple[Array, Array]:
 def counted(counts: Counts, bits: int, given: Array | slice = slice(None)) -> Codes:
     """Return the chosen frames as codes of an ideal counter with this many bits, or of sums of planes of a SPAD."""
     if counts.sums is not None:
-        clocked = BinarySPAD(1.0, 0.0).of_planes(counts.sums.planes)
+        clocked = ideal_clocked(counts.sums.planes)
         sums = array_codes(counts.frames[given], clocked, 1.0, counts.name)
         return replace(sums, ppp=counts.light, sensor_name="ideal clocked SPAD")
     _check_bits(counts, bits)

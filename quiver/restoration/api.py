@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.streams.plane_sums import PlaneSums
+from qsim.plane_sums import PlaneSums
 from quiver.data.clips import Clip
 from quiver.data.codes import (
     Codes,

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qsim.checks import ArgumentError
-from qsim.sensor.defects import defect_table
-from qsim.streams.plane_sums import AS_STORED, PlaneSums
+from qsim.plane_sums import AS_STORED, PlaneSums
 from quiver.data.clips import Clip, open_clips
 from quiver.data.codes import Codes, codes_of, filled, light_of, open_stream, repaired, sensed, stream_codes, summed
 from quiver.data.defects import read_map
 from quiver.data.hot_pixels import scanned
-from quiver.data.illumination import Illumination, colour_filter, follows_light
+from quiver.data.illumination import Illumination, colour_filter, follows_light, from_toml
 from quiver.data.photon_cubes import cube_codes
 from quiver.restoration.interface import AUTO
 from quiver.restoration.mosaics import check_bands
@@ -121,7 +120,7 @@ def _of_array(path: Path, asked: RestoreSettings, sums: PlaneSums) -> Codes:
     codes = cube_codes(path, light, asked.frame_rate or FRAME_RATE, sums=sums, width=asked.width)
     if not sensor.endswith(".toml"):
         return codes
-    return repaired(replace(codes, colour=colour_filter.from_toml(sensor)), defect_table.from_toml(sensor))
+    return repaired(replace(codes, colour=colour_filter.from_toml(sensor)), from_toml(sensor))
 
 
 def _sensor(asked: RestoreSettings) -> str:

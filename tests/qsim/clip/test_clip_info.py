@@ -19,7 +19,8 @@ from qsim.clip.clip_info import (
     Saturation,
     SceneName,
 )
-from qsim.clip.source import Source, Times
+from qsim.clip.source import Source
+from qsim.frame_times import Times
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
 from qsim.optics.radiometry import RGB

@@ -7,7 +7,7 @@ import pytest
 from clips import packed
 from numpy import ndarray as Array
 
-from qsim.streams.plane_sums import PlaneSums
+from qsim.plane_sums import PlaneSums
 from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes
 
@@ -39,7 +39,7 @@ def test_planes_unpacked_in_pieces_are_the_same(tmp_path, monkeypatch):
     drawn = np.random.default_rng(1).integers(0, 2, (511 * 2, 3, 11), dtype=np.uint8)
     path = packed(drawn, tmp_path / "c.npy")
     whole = cube_codes(path, SPAD, 1000.0, sums=PlaneSums(planes=511), width=11).read(0, 2)
-    monkeypatch.setattr("qsim.streams.plane_sums.PLANE_PIXELS", 3 * 11 * 7)
+    monkeypatch.setattr("qsim.plane_sums.PLANE_PIXELS", 3 * 11 * 7)
     np.testing.assert_array_equal(
         cube_codes(path, SPAD, 1000.0, sums=PlaneSums(planes=511), width=11).read(0, 2), whole
     )

@@ -12,7 +12,7 @@ from numpy import ndarray as Array
 import quiver
 from qsim import BinarySPAD, PlaneSums, Stream
 from qsim.cli import main
-from qsim.clip.source import Times
+from qsim.frame_times import Times
 from quiver.cli import main as quiver_main
 
 RATE = 10000.0

@@ -17,7 +17,7 @@ from msgspec import Meta
 from numpy import ndarray as Array
 
 from qsim.checks import ArgumentError
-from qsim.clip.source import Times
+from qsim.frame_times import Times
 from qsim.kinds import Count, Whole
 from qsim.settings import setting, settle
 
