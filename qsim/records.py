@@ -9,6 +9,7 @@ in the manual (`words_of`), and written into the JSON Schema. Further rules are 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 import types
 from collections.abc import Callable, Mapping
@@ -90,6 +91,12 @@ def settle(record: Any) -> None:
 
 def hints_of(kind: Any) -> dict[str, Any]:
     """Return the types of a record's fields, with their bounds, in order."""
+    return dict(_hints_of(kind))
+
+
+@functools.lru_cache(maxsize=512)
+def _hints_of(kind: Any) -> dict[str, Any]:
+    """Return the same; evaluating annotations took a quarter of the time of a training window."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
 
