@@ -4,20 +4,42 @@
 
 A pixel is followed through the flow of every frame on its way. Between pixels the flow is that of the four around the
 place, weighted as in bilinear interpolation, and only pixels of the same body count: motion is not mixed over an edge.
-A point is lost where fewer than half of the weights remain. It then goes on with its last step, and is not valid.
+Of a body that hides itself only pixels at about the depth of the point count. A point is lost where none of them does.
+It then goes on with its last step, and is not valid.
 """
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clip_folder import ClipFolder
+KNOWN = 0.01  # of the weights around a place: with less, its flow is not known
+FAR = 1e30  # m: the depth of what has none
+APART = 0.01  # of a depth: pixels of one body that are farther apart are not neighbours on it
 
-KNOWN = 0.5  # of the weights around a place: with less, its flow is not known
+
+class Moving(Protocol):
+    """Frames with flow, as those of a clip folder."""
+
+    def flow(self, t: int) -> Array:
+        """Return flow, float32 [2, H, W] px, from frame t to the next."""
+
+    def valid(self, t: int) -> Array:
+        """Return bool [H, W]: whether the point of frame t is seen in the next one."""
+
+    def holds(self, channel: str) -> bool:
+        """Return whether the frames have a channel of truth, such as id."""
+
+    def body_id(self, t: int) -> Array:
+        """Return the body of each pixel, int32 [H, W]."""
+
+    def depth(self, t: int) -> Array:
+        """Return the depth of each pixel, float32 [H, W] m."""
 
 
-def composed(clip: ClipFolder, first: int, last: int) -> tuple[Array, Array]:
+def composed(clip: Moving, first: int, last: int) -> tuple[Array, Array]:
     """Return flow, float32 [2, H, W] (u right, v down) [px], and validity, bool [H, W], from frame first to last.
 
     p of frame `first` is at p + flow(p) in frame `last`. It is valid if the point is seen in every frame on its way. Of
@@ -27,29 +49,37 @@ def composed(clip: ClipFolder, first: int, last: int) -> tuple[Array, Array]:
     valid = clip.valid(first)
     if last == first + 1:
         return flow, valid
-    body = _body(clip, first)
+    body = clip.body_id(first) if clip.holds("id") else None
+    depth = np.minimum(clip.depth(first).astype(np.float64), FAR) if clip.holds("Z") else None
     start = np.stack(np.meshgrid(*map(np.arange, flow.shape[1:]), indexing="ij")[::-1]).astype(np.float64)
     step = flow.astype(np.float64)
     valid = valid & np.isfinite(step).all(axis=0)
     step = np.where(np.isfinite(step), step, 0.0)
     moved = step
     for t in range(first + 1, last):
-        found, known = _between(clip, t, start + moved, body)
+        found, known, depth = _between(clip, t, start + moved, body, depth)
         step = np.where(known, found, step)
         valid &= known
         moved = moved + step
     return moved.astype(np.float32), valid
 
 
-def _between(clip: ClipFolder, t: int, place: Array, body: Array | None) -> tuple[Array, Array]:
-    """Return the flow [2, H, W] of frame t at places (x, y) [2, H, W] px of points of a body, and where it is known."""
+def _between(
+    clip: Moving, t: int, place: Array, body: Array | None, depth: Array | None
+) -> tuple[Array, Array, Array | None]:
+    """Return the flow [2, H, W] of frame t at places (x, y) [2, H, W] px of points, where it is known, and their depth.
+
+    The points are those of a body, and were at a depth in the frame before.
+    """
     flow = clip.flow(t)
     seen = clip.valid(t) & np.isfinite(flow).all(axis=0)
-    bodies = _body(clip, t)
+    bodies = None if body is None else clip.body_id(t)
+    depths = None if depth is None else np.minimum(clip.depth(t).astype(np.float64), FAR)
     height, width = seen.shape
     corner = np.floor(place)
     share = place - corner
     total = np.zeros(place.shape)
+    deep = np.zeros(seen.shape)
     weights = np.zeros(seen.shape)
     for right in (0, 1):
         for down in (0, 1):
@@ -61,13 +91,12 @@ def _between(clip: ClipFolder, t: int, place: Array, body: Array | None) -> tupl
             usable = inside & seen[at]
             if body is not None and bodies is not None:
                 usable &= bodies[at] == body
+            if depth is not None and depths is not None:
+                usable &= np.abs(depths[at] - depth) <= APART * depth
+                deep += np.where(usable, weight * depths[at], 0.0)
             weight = np.where(usable, weight, 0.0)
             total += weight * np.where(usable, flow[:, *at], 0.0)
             weights += weight
     known = weights >= KNOWN
-    return total / np.where(known, weights, 1.0), known
-
-
-def _body(clip: ClipFolder, t: int) -> Array | None:
-    """Return the body of each pixel of frame t, int32 [H, W]; None if the clip does not state them."""
-    return clip.body_id(t) if clip.holds("id") else None
+    sums = np.where(known, weights, 1.0)
+    return total / sums, known, None if depth is None else np.where(known, deep / sums, depth)
