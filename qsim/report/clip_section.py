@@ -33,7 +33,7 @@ from qsim.report.panels import (
 from qsim.sensor.defects import fixed_pattern
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.streams.clip import Clip
-from qsim.streams.photons import clip_photons
+from qsim.streams.storing import stored
 from qsim.streams.stream import Stream
 
 if TYPE_CHECKING:
@@ -242,13 +242,9 @@ def unexpected(clip: Clip, stream: Stream) -> str | None:
     own = stream.info.defects
     if 2**stream.bits > 64:
         return "more than 64 codes"
-    if stream.rows is not None:
-        return "every row sees its own part of two frames of the clip"
-    if not stream.timing.even:
-        return "its codes have different exposures"
-    if stream.info.planes_per_code > 1 or stream.info.planes_of or len(stream) != len(clip):
-        return "a code sums planes of several frames of the clip"
-    if stream.info.light is None:
+    if stream.info.planes_of:
+        return "its codes sum planes of another clip"
+    if stream.info.light is None or stream.info.clip_key is None:
         return "its light is unknown"
     if own.get("crosstalk") or own.get("afterpulse"):
         return "crosstalk and afterpulses make a code depend on its neighbours or on the frame before"
@@ -258,34 +254,44 @@ def unexpected(clip: Clip, stream: Stream) -> str | None:
 
 
 def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64]:
-    """Return the mean probability of each code over every n-th pixel of some frames, float64 [2^bits].
+    """Return the mean probability of each code over every n-th pixel of some of the first codes, float64 [2^bits].
 
-    Under flicker all `count` frames are taken, so that none of its phases is left out; a mosaic keeps all its colours.
-    The maps of defects are included. Raise `ValueError` or `OSError` if a measured map has changed or is missing.
+    Each has the light of its own exposures. Under flicker, and where exposures take turns, all `count` codes are taken,
+    so that none of their phases is left out; a mosaic keeps all its colours. The maps of defects are included. Raise
+    `ValueError` or `OSError` if a measured map has changed or is missing.
     """
-    samples = count if clip.strengths else min(count, _SAMPLES)
+    samples = count if clip.strengths or not stream.timing.even else min(count, _SAMPLES)
     chosen = np.unique(np.linspace(0, count - 1, samples).astype(int))
     height, width = clip.shape[1:]
-    share = max(1.0, len(chosen) / _SAMPLES)  # more frames, fewer pixels of each
+    share = max(1.0, len(chosen) / _SAMPLES)  # more codes, fewer pixels of each
     step = mosaic_step(max(1, int(np.sqrt(height * width * share / _PIXELS))), stream.colour_filter)
-    blurred = stream.info.sensing.diffraction
-    light = []
-    for t in chosen:
-        each = clip_photons(clip, int(t), stream.photons_factor, diffraction=blurred)
-        if stream.colour_filter is not None:
-            each = stream.colour_filter.mosaic(each, stream.sensor.efficiency)
-        light.append(each[::step, ::step].copy())  # not a view, which would keep the whole frame in memory
-    sensor = stream.sensor
+    draw = stored(stream)
+    exposures = draw.exposures(clip)
+    sensor = draw.plane
     maps = fixed_pattern.PERFECT
-    found = stream.defects
-    if found is not None:
-        device = PixelArray.of(found, sensor, height, width, stream.origin)
+    if draw.defects is not None:
+        device = PixelArray.of(draw.defects, sensor, height, width, stream.origin)
         thinned = {name: None if m is None else m[::step, ::step] for name, m in vars(device.maps).items()}
         sensor = device.sensor
         maps = fixed_pattern.Maps(**thinned)
-    probabilities = fixed_pattern.pmf(sensor, np.stack(light), stream.exposure, maps)
-    mean: NDArray[np.float64] = probabilities.reshape(-1, probabilities.shape[-1]).mean(axis=0)
-    return mean
+    total = np.zeros(2**stream.bits)
+    for t in chosen:
+        light = draw.light(clip, int(t), int(t) + 1)[:, ::step, ::step]
+        each = fixed_pattern.pmf(sensor, light, exposures.seconds(int(t)), maps)
+        found = _of_sum(each.reshape(len(each), -1, each.shape[-1])).mean(axis=0)
+        total[: len(found)] += found / len(chosen)
+    return total
+
+
+def _of_sum(chances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the probability of each sum of codes, [P, levels], from those of each code, [n, P, levels of one]."""
+    found = chances[0]
+    for more in chances[1:]:
+        longer = np.zeros((found.shape[0], found.shape[1] + more.shape[1] - 1))
+        for code in range(more.shape[1]):
+            longer[:, code : code + found.shape[1]] += found * more[:, code : code + 1]
+        found = longer
+    return found
 
 
 def _motion_histogram(speed: NDArray[np.floating], which: str) -> Markup:
