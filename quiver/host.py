@@ -16,6 +16,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
+from qsim import host
 from quiver.device import DEVICES
 
 Given = ParamSpec("Given")
@@ -39,7 +40,7 @@ def numbers() -> Iterator[None]:
     import torch
 
     with ExitStack() as stack:
-        stack.enter_context(np.errstate(divide="warn", over="warn", invalid="warn", under="ignore"))
+        stack.enter_context(host.numbers())
         for device in DEVICES[1:]:
             if torch.is_autocast_enabled(device):
                 stack.enter_context(torch.autocast(device, enabled=False))

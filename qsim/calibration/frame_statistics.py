@@ -16,6 +16,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
+from qsim.host import own_numbers
 
 SAMPLED_PIXELS = 1 << 17  # most pixels, and frames, whose codes are kept for a fit of the histograms
 SAMPLED_FRAMES = 256
@@ -100,6 +101,7 @@ class FrameStatistics:
         return float((products / (t - 1)).mean()) + self.variance / t
 
 
+@own_numbers
 def measure(
     blocks: Iterable[Array], *, bits: int, exposure: float, photons: float | None, name: str = "stack"
 ) -> FrameStatistics:

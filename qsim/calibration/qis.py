@@ -28,6 +28,7 @@ from qsim.calibration.prnu import measure_pattern
 from qsim.calibration.quantiles import student_quantile
 from qsim.calibration.results import Z95, Calibration, Value, odd_efficiency
 from qsim.calibration.warm_pixels import hidden, without_warm
+from qsim.host import own_numbers
 from qsim.sensor.qis import QIS
 
 METHOD = "likelihood of the codes"
@@ -35,6 +36,7 @@ MOST_OPEN = 2.0  # most high end over low end of the gain, for which electrons p
 REPEATS = 15  # of a fit whose profile met a larger likelihood
 
 
+@own_numbers
 def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], *, bits: int) -> Calibration:
     """Estimate gain, offset, read noise, dark current, PRNU and, if the flats' photons are known, QE of a QIS.
 

@@ -29,6 +29,7 @@ from qsim.calibration.prnu import BY_DARK, BY_FLAT, Flat, hot_by_rate, measure_p
 from qsim.calibration.quantiles import chi2_quantile
 from qsim.calibration.results import Z95, Calibration, Value, odd_efficiency, poisson_interval
 from qsim.calibration.spad_response import NEIGHBOURS, Response, over_neighbours
+from qsim.host import own_numbers
 
 NO_EVENT_BOUND = -log(0.025)  # expected events at which none occurs in 2.5 % of the cases: end of a two-sided 95 %
 FEW_COUNTS = 100  # from here on a normal interval differs from the exact one by about a tenth of its half-width
@@ -36,6 +37,7 @@ _LIT = 0.05  # of a typical pixel's counts, due to hot neighbours, above which i
 NEARLY_SATURATED = 50.0  # counts missing to saturation, below which a pixel's rate has an exact interval of its own
 
 
+@own_numbers
 def calibrate_spad(
     darks: Sequence[FrameStatistics],
     flats: Sequence[FrameStatistics],

@@ -27,10 +27,12 @@ from qsim.clip import exr
 from qsim.clip.clip_info import ClipInfo, frame_file
 from qsim.clip.lazy_array import LazyArray
 from qsim.clip.manifest import TRUTH, read_info
+from qsim.host import own_numbers
 from qsim.optics.camera import Camera
 from qsim.optics.radiometry import Crop, check_crop
 
 
+@own_numbers
 @dataclass(frozen=True, eq=False)
 class ClipFolder:
     """A complete clip folder; frames are read on demand."""

@@ -26,6 +26,7 @@ from qsim.clip.clip_info import ClipInfo, FrameFile, frame_file
 from qsim.clip.manifest import OURS, TRUTH, check_replaced, info_of, read_info, target_of
 from qsim.colour import bright_end
 from qsim.files import VERSION, check_name
+from qsim.host import own_numbers
 from qsim.kinds import Count, Digest, NotNegative
 from qsim.optics import radiometry
 
@@ -48,6 +49,7 @@ class FrameEntry:
     code_errors_at: tuple[tuple[NotNegative, NotNegative], ...] = ()  # as errors_at
 
 
+@own_numbers
 class ClipWriter:
     """Writes a clip frame by frame to PATH.part and renames it when all frames are stored.
 

@@ -16,6 +16,7 @@ from qsim.checks import SPLITS, file_path
 from qsim.dataset.job_record import JobInfo, record_path, verify_job
 from qsim.dataset.recipe_file import RecipeFile
 from qsim.files import Progress
+from qsim.host import own_numbers
 from qsim.kinds import Name
 from qsim.rendering.render_settings import RenderSettings
 from qsim.streams.clip import Clip
@@ -40,6 +41,7 @@ class DatasetInfo:
         return all(job.state == "done" for job in self.jobs.values())
 
 
+@own_numbers
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """A data set folder; only clips that have a record are listed."""

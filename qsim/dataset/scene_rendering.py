@@ -16,6 +16,7 @@ from qsim.clip.clip_info import Origin
 from qsim.clip.manifest import target_of
 from qsim.dataset import scene_files
 from qsim.files import NAME, Progress
+from qsim.host import own_numbers
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.fidelity import choose_budget
@@ -26,6 +27,7 @@ from qsim.scenes.colours import coloured
 from qsim.streams.clip import Clip
 
 
+@own_numbers
 def render(  # noqa: PLR0913 (settings of a public function)
     scene: Scene | str | os.PathLike[str],
     path: str | os.PathLike[str] | None = None,
@@ -174,11 +176,20 @@ def in_bands(scene: Scene, bands: Literal["rgb"] | None) -> Scene:
 
 
 class TemporaryFolder:
-    """A folder that is deleted with the last object that refers to it, in the process that made it."""
+    """A folder that is deleted with the last object that refers to it, in the process that made it.
+
+    Copies of an object refer to the same folder. One that was pickled uses it as long as those of the process do.
+    """
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="qsim-"))
         weakref.finalize(self, _delete, self.path, os.getpid())
+
+    def __copy__(self) -> TemporaryFolder:
+        return self
+
+    def __deepcopy__(self, known: dict[int, object]) -> TemporaryFolder:
+        return self
 
 
 def _delete(path: Path, owner: int) -> None:

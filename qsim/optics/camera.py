@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from qsim.host import own_numbers
 from qsim.kinds import Number, Positive, Whole
 from qsim.optics.lens import Lens
 from qsim.optics.zoom import Zoom
@@ -34,6 +35,7 @@ def checked_pitch(pitch: float, where: str) -> float:
     return pitch
 
 
+@own_numbers
 @dataclass(frozen=True, eq=False)
 class Camera:
     """Lens, pixels, position and orientation of the camera. With a `zoom`, `at` gives the camera of any time."""

@@ -18,6 +18,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
+from qsim.host import own_numbers
 from qsim.kinds import LARGEST, SMALLEST
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
@@ -89,6 +90,7 @@ def photon_energy(wavelength: float) -> float:
     return PLANCK * LIGHT_SPEED / wavelength
 
 
+@own_numbers
 def to_irradiance(radiance: Array, camera: Camera, cos_theta: float | Array = 1.0) -> Array:
     """Return the faceplate irradiance [W m^-2], float64 [...]: pi L T cos^4(theta) / (4 N^2) of a distant scene.
 
@@ -98,6 +100,7 @@ def to_irradiance(radiance: Array, camera: Camera, cos_theta: float | Array = 1.
     return np.asarray(radiance, np.float64) * (scale * cos_theta**4)
 
 
+@own_numbers
 def to_photons(irradiance: Array, camera: Camera, exposure: float) -> Array:
     """Return expected photons per pixel in `exposure` [s], float64 [...], of irradiance [...] [W m^-2].
 
@@ -106,6 +109,7 @@ def to_photons(irradiance: Array, camera: Camera, exposure: float) -> Array:
     return np.asarray(irradiance, np.float64) * (camera.pixel_area * exposure / photon_energy(camera.wavelength))
 
 
+@own_numbers
 def expected_photons(
     radiance: Array, camera: Camera, exposure: float, *, origin: tuple[int, int] | None = None
 ) -> Array:
@@ -131,6 +135,7 @@ def expected_photons(
     return to_photons(to_irradiance(radiance, camera, cosines), camera, exposure)
 
 
+@own_numbers
 def band_photons(
     radiance: Array, camera: Camera, exposure: float, bands: Sequence[float], *, origin: tuple[int, int] | None = None
 ) -> Array:

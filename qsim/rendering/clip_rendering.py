@@ -10,6 +10,7 @@ from dataclasses import asdict, replace
 from qsim import files, records
 from qsim.clip.clip_info import PHYSICAL, ClipInfo, FlickerInfo, Matrix, Origin, RenderInfo, SceneName
 from qsim.clip.writer import ClipWriter
+from qsim.host import own_numbers
 from qsim.rendering.budget import Budget
 from qsim.rendering.engine import free_memory
 from qsim.rendering.renderer import Crop, Renderer
@@ -17,6 +18,7 @@ from qsim.scene import Scene
 from qsim.streams.clip import Clip
 
 
+@own_numbers
 def render_clip(  # noqa: PLR0913 (settings of a public function)
     scene: Scene,
     path: str | os.PathLike[str],

@@ -23,6 +23,7 @@ from numpy import ndarray as Array
 from qsim.clip.clamped_error import Errors, Stated, white_in
 from qsim.clip.motion_statistics import MOVING
 from qsim.colour import bright_end, psnr
+from qsim.host import own_numbers
 from qsim.optics.camera import Camera
 from qsim.optics.diffraction import diffraction_line
 from qsim.optics.radiometry import WHITE_PER_MEAN
@@ -66,6 +67,7 @@ class Noise:
         return Errors(*(_error(errors, samples) / math.sqrt(instants) for errors in (self.at_white, self.plain)))
 
 
+@own_numbers
 def choose_budget(  # noqa: PLR0913 (settings of a public function)
     scene: Scene,
     *,

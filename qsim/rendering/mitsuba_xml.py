@@ -21,6 +21,7 @@ import numpy as np
 from qsim import files
 from qsim.checks import file_path, suggest
 from qsim.device_lock import one_thread_at_a_time
+from qsim.host import own_numbers
 from qsim.optics.camera import Camera, Pose, Vector
 from qsim.optics.lens import Lens
 from qsim.optics.radiometry import RGB
@@ -41,6 +42,7 @@ EMISSION = (  # what scales a light: lamp or glow, even, point or spot, parallel
 )
 
 
+@own_numbers
 @one_thread_at_a_time
 def read_mitsuba(
     xml: str | Path,
@@ -80,7 +82,7 @@ def read_mitsuba(
         if _has_holes(mi, shape):
             warnings.warn(
                 f"{path}: shape {shape.id()!r} has holes by its opacity; truth (flow, depth, bodies) ignores them",
-                stacklevel=2,
+                stacklevel=4,
             )
     reason = _rejected(mi, loaded)
     if reason is not None:

@@ -24,6 +24,7 @@ from numpy import ndarray as Array
 from qsim.backend import RenderEngine
 from qsim.clip.clamped_error import Errors, StatedError, error_at, frame_errors, rms, white_in
 from qsim.device_lock import one_thread_at_a_time
+from qsim.host import own_numbers
 from qsim.keys import Key, hash_name, words
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.rendering import ground_truth
@@ -70,6 +71,7 @@ class Frame:
         return {name: value for name in names if (value := getattr(self, name)) is not None}
 
 
+@own_numbers
 class Renderer:
     """A scene loaded once; `frame(t)` moves it and renders, in any order of t.
 
@@ -122,6 +124,17 @@ class Renderer:
                 raise ValueError(f"Budget.neighbours: frames with {reason} cannot share samples; set it to 0")
             self._whole = self.window((0, 0, scene.camera.height, scene.camera.width))
             self._carrier = self._whole.carrier(self.budget, frames)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how to make it again, for pickles and deep copies: Mitsuba's objects cannot be copied."""
+        given: dict[str, Any] = {
+            "frame_rate": self.frame_rate,
+            "shutter": self.shutter,
+            "seed": self.seed,
+            "budget": self.budget,
+        }
+        given |= {"crop": self.crop, "thinned": self.film.thinned, "frames": self.frames}
+        return partial(Renderer, self.scene, **given), ()
 
     @property
     def variant(self) -> str:

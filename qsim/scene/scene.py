@@ -21,6 +21,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from qsim.checks import require_finite
+from qsim.host import own_numbers
 from qsim.optics.camera import Camera, Pose
 from qsim.scene.bands import Bands, check_bands, has_colour, largest
 from qsim.scene.flicker import Flicker
@@ -124,6 +125,7 @@ class Part:
         return np.eye(4) if self.motion is None else np.asarray(self.motion.pose(t), np.float64)
 
 
+@own_numbers
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A camera, lights and bodies, with the family and seed they came from."""

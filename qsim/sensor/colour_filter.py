@@ -28,6 +28,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import suggest
+from qsim.host import own_numbers
 
 BANDS = "RGB"
 MASKS = {
@@ -41,6 +42,7 @@ MASKS = {
 Efficiency = tuple[float, float, float]  # electrons or avalanches per photon of R, G and B
 
 
+@own_numbers
 @dataclass(frozen=True)
 class ColourFilter:
     """A colour filter array. The tile repeats over the frame, from its pixel (0, 0) on."""

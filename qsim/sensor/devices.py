@@ -30,6 +30,7 @@ from types import MappingProxyType
 
 from qsim import files
 from qsim.checks import ArgumentError, file_path, suggest
+from qsim.host import own_numbers
 from qsim.records import convert
 from qsim.sensor import file_laws
 from qsim.sensor.counting import CountingSPAD
@@ -237,6 +238,7 @@ DEVICES: Mapping[str, Device] = MappingProxyType(
 TABLES = ("sensor", "sources", "defects", "colour")  # of a file; defect_table.py and colour_filter.py read the last two
 
 
+@own_numbers
 def load(
     name: str | Path | Sensor,
     *,

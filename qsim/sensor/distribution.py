@@ -25,6 +25,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
+from qsim.host import own_numbers
 from qsim.keys import uniform, uniform_pair
 
 _TOGETHER = 1 << 22  # probabilities held at a time
@@ -35,8 +36,13 @@ SHORTEST = 1e-18
 MANY_BITS = 9  # from which moments are computed from the codes near the mean
 
 
+@own_numbers
 class Distribution(ABC):
     """The law of the codes of one pixel. Subclasses are frozen dataclasses of its parameters."""
+
+    def __init_subclass__(cls) -> None:
+        """Let the methods of a subclass compute as in a program that has set nothing in NumPy, too."""
+        own_numbers(cls)
 
     bits: int  # of a code, 1 ... 16
     code_model: ClassVar[str]  # kind of code: "multibit" read, "binary_sum" of planes, "counting"

@@ -15,6 +15,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.host import own_numbers
 from qsim.sensor import code_likelihood
 from qsim.sensor.distribution import Distribution
 
@@ -34,6 +35,7 @@ _TOO_DARK = "{}: dark counts alone exceed the light above which the mean code fa
 _IMPOSSIBLE = "histogram{} contains code {}, which has probability 0 at every light level for {!r}"
 
 
+@own_numbers
 @dataclass(frozen=True)
 class Response:
     """Exact mean and variance of one code over a grid of photons, evenly spaced in sqrt(photons), rising in mean."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
+from qsim.host import own_numbers
 
 MAX_BITS = 16
 
@@ -49,6 +50,7 @@ def index_text(index: tuple[int, ...]) -> str:
     return f"({', '.join(names)}) = ({', '.join(map(str, index))})"
 
 
+@own_numbers
 def pack(codes: Array, bits: int) -> Array:
     """Return packed bytes [..., ceil(W * bits / 8)] of codes [..., W]; `ValueError` if a code does not fit."""
     codes = plain(codes)
@@ -75,6 +77,7 @@ def pack(codes: Array, bits: int) -> Array:
     return np.ascontiguousarray(rows[..., : packed_width(codes.shape[-1], bits)])
 
 
+@own_numbers
 def unpack(packed: Array, bits: int, width: int) -> Array:
     """Return codes [..., width] of packed bytes [..., ceil(width * bits / 8)]: uint8, or uint16 above 8 bits.
 

@@ -321,5 +321,5 @@ def fast_engine_works() -> bool:
     except ImportError:  # Dr.Jit is not installed
         usable = False
     if not usable:
-        warnings.warn("no usable LLVM or CUDA: codes are drawn by the NumPy engine, exact but slow", stacklevel=4)
+        warnings.warn("no usable LLVM or CUDA: codes are drawn by the NumPy engine, exact but slow", stacklevel=5)
     return usable

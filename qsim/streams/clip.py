@@ -15,6 +15,7 @@ from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.clip_info import RELATIVE
 from qsim.clip.film import Film, card
 from qsim.files import Progress
+from qsim.host import own_numbers
 from qsim.keys import hash_name
 from qsim.kinds import Text
 from qsim.sensor.sensor import Sensor
@@ -33,6 +34,7 @@ class _Asked(Sensing):
     progress: Progress | None = field(default=None, kw_only=True)
 
 
+@own_numbers
 @dataclass(frozen=True, eq=False)
 class Clip(ClipFolder):
     """A complete clip folder and its streams; frames are read on demand."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip_folder import ClipFolder
+from qsim.host import own_numbers
 from qsim.optics.camera import checked_pitch
 from qsim.optics.diffraction import diffract
 from qsim.optics.radiometry import (
@@ -27,6 +28,7 @@ EXAMPLE_PITCH = 1.1e-6  # m, of a QIS: what the message about lux without a lens
 _MOST = 1e12  # photons per pixel and frame: the exact laws are tested up to it
 
 
+@own_numbers
 def light_level(
     clip: ClipFolder, *, ppp: float | None = None, lux: float | None = None, pixel_pitch: float | None = None
 ) -> LightLevel:
@@ -84,6 +86,7 @@ def _checked(clip: ClipFolder, ppp: float) -> float:
     return ppp
 
 
+@own_numbers
 def clip_photons(
     clip: ClipFolder,
     t: int,

@@ -14,6 +14,7 @@ from numpy import ndarray as Array
 from qsim import locks, scratch
 from qsim.clip.clip_folder import ClipFolder
 from qsim.files import Progress, check_name
+from qsim.host import own_numbers
 from qsim.keys import Key
 from qsim.optics.radiometry import LightLevel
 from qsim.sensor import devices, file_laws, packing
@@ -78,6 +79,7 @@ def stored(stream: Stream) -> Draw:
     )
 
 
+@own_numbers
 def sense(
     clip: ClipFolder,
     sensing: Sensing,
@@ -135,6 +137,7 @@ def _kept(clip: ClipFolder, sensing: Sensing, info: StreamInfo) -> Stream | None
     )
 
 
+@own_numbers
 def replay(clip: ClipFolder, stream: Stream, frame: int) -> tuple[Array, Array]:
     """Return one frame drawn again from the stream's json, and the stored frame: codes [H, W] each."""
     if not 0 <= frame < len(stream):

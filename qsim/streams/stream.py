@@ -25,6 +25,7 @@ from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
 from qsim.clip.lazy_array import LazyArray
 from qsim.files import VERSION, Progress
+from qsim.host import own_numbers
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.plane_sums import Sums
 from qsim.sensor import packing
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 _DAMAGED = "the file is damaged: sense it again and replace it"
 
 
+@own_numbers
 @dataclass(frozen=True, eq=False)
 class Stream:
     """Codes of one clip seen by one sensor at one light level."""

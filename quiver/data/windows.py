@@ -44,6 +44,7 @@ from quiver.data.window_noise import (
     check_windows,
     window_filler,
 )
+from quiver.host import own_numbers
 
 # Computes inputs of a network from the codes of a window: name -> tensor, each the same shape for all windows. It runs
 # where samples are drawn, in worker processes too, and gets no gradients; it is a function of a module, not a lambda.
@@ -209,6 +210,7 @@ class Windows(Dataset[dict[str, Any]]):
         """Yield the windows of the first epoch."""
         return (self[n] for n in range(len(self)))
 
+    @own_numbers
     def __getitem__(self, n: int) -> dict[str, Any]:
         place = self.place(n)
         clip = self.clips[place.clip]
@@ -305,6 +307,7 @@ class Windows(Dataset[dict[str, Any]]):
         return self._draws[place.clip, place.light]
 
 
+@own_numbers
 def windows(
     source: Clip | Stream | Sequence[Clip] | str | os.PathLike[str],
     *,

@@ -30,6 +30,7 @@ from quiver.data.illumination import Illumination, file_digests, labels, read_se
 from quiver.device import PeakMemory
 from quiver.evaluation import breakdown, metrics
 from quiver.evaluation.comparison_rows import ComparisonRow, append, stored_rows
+from quiver.host import own_numbers
 from quiver.restoration.interface import Restorer
 from quiver.restoration.networks import settings_of
 
@@ -103,6 +104,7 @@ def truth_psnr(truth: CodeTruth, peak: float, codes: range) -> float | None:
     return metrics.truth_psnr([errors[truth.exposures.middle_frame(t)] * unit for t in codes])
 
 
+@own_numbers
 def score_video(video: Array, stream: Stream, *, peak: float | None = None) -> metrics.Score:
     """Return the score of restored video, [T, H, W] or [T, 3, H, W], in photons against the truth of its stream.
 

@@ -27,6 +27,7 @@ from quiver.data.codes import (
 from quiver.data.defects import check_map
 from quiver.data.hot_pixels import scanned
 from quiver.data.illumination import Illumination, is_known
+from quiver.host import own_numbers
 from quiver.restoration.automatic import chosen
 from quiver.restoration.interface import AUTO, DEFAULT_METHOD, RestoreOptions, refuse_outside, remarks
 from quiver.restoration.restored_file import check_finite
@@ -35,6 +36,7 @@ from quiver.restoration.sources import codes_of, refuse_idle
 Source = Stream | Clip | str | os.PathLike[str] | Array
 
 
+@own_numbers
 def restore(  # noqa: PLR0913 (settings of a public function)
     source: Source | LazyArray,
     method: str = DEFAULT_METHOD,
@@ -84,7 +86,7 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     if codes.scan and codes.defective is not None:
         found.append(f"{codes.name}: {codes.scan}, and filled; leave them with scan=False")
     for text in found:
-        warnings.warn(text, stacklevel=2)
+        warnings.warn(text, stacklevel=3)  # behind `own_numbers`
     restored = runner.restore(codes)
     try:
         check_finite(restored, runner.name)

@@ -15,6 +15,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.arrays import plain
+from qsim.host import own_numbers
 from qsim.keys import Key, require_counters
 from qsim.sensor.defects.correlated_noise import CorrelatedNoise
 from qsim.sensor.defects.defect_table import Defects
@@ -26,6 +27,7 @@ from qsim.sensor.spad import BinarySPAD
 Sampler = Callable[[Sensor, Array, float, Key, tuple[int, int]], Array]  # photons, exposure, key, origin -> codes
 
 
+@own_numbers
 @dataclass(frozen=True, eq=False)
 class PixelArray:
     """A sensor model with per-pixel maps of one frame size, and its defects."""
