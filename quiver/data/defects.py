@@ -9,8 +9,8 @@ that the sensor cannot produce: there one of the eight codes is chosen by weight
 is keyed by frame and pixel: repeats are equal. Other frames are not used: what moves is elsewhere in them, and every
 method merges frames itself.
 
-The map is given, or known: a stream drawn with a table [defects] states its dead and hot pixels. It is not guessed from
-the codes: a hot pixel looks like a small bright thing at rest, and at 13 % hot pixels they touch one another.
+The map is given, or known: a stream drawn with a table [defects] states its dead and hot pixels. Of a recording without
+a map, hot pixels are found by their own codes where light moves (hot_pixels.py).
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from qsim.checks import ArgumentError
 from qsim.files import decoding_errors, load_array, read_npy
 from qsim.plane_sums import PlaneSums, Sums
 from qsim.streams.sensing import Sensing
-from quiver.data.codes import open_stream, stream_codes, summed
+from quiver.data.codes import codes_of, open_stream, summed
 from quiver.data.illumination import Illumination, ideal_clocked
 from quiver.data.photon_cubes import cube_codes
 
@@ -57,7 +57,7 @@ def read_planes(path: Path, sums: PlaneSums, width: int | None) -> Counts:
     if path.with_suffix(".json").is_file() and path.suffix in (".npy", ".json"):
         if width is not None:
             raise ArgumentError("width", f"{path} is a stored stream, which has its own (see its .json); leave it out")
-        codes = summed(stream_codes(open_stream(path)), sums)
+        codes = summed(codes_of(open_stream(path)), sums)
         rate = codes.frame_rate * (sums.every or sums.planes or 1)
     else:
         codes = cube_codes(path, Illumination(Sensing(ideal_clocked())), 1.0, sums=sums, width=width)

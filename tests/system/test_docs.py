@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from spad_files import write_recordings
 
 import qsim.cli.program
 import quiver.cli.program
@@ -197,7 +198,21 @@ def _calibration(folder: Path) -> None:
     )
 
 
-BEFORE: dict[str, Callable[[Path], None]] = {"docs/calibrate.md": _calibration}
+def _spad_camera(folder: Path) -> None:
+    """Raw planes of a small camera, and the recipe `spad` with one small clip, which is as long."""
+    write_recordings(folder)
+    text = (ROOT / "scenes" / "spad.toml").read_text()
+    head, fan, *_, streams = re.split(r"(?=\[\[)", text)
+    text = f"{head}{fan}{streams}"
+    for key, value in {"height": 32, "width": 32, "psnr": 15.0}.items():
+        text = re.sub(rf"^{key} = .*", f"{key} = {value}", text, flags=re.MULTILINE)
+    (folder / "small.toml").write_text(text)
+
+
+BEFORE: dict[str, Callable[[Path], None]] = {
+    "docs/calibrate.md": _calibration,
+    "docs/spad_camera.md": _spad_camera,
+}
 
 
 def _environment() -> dict[str, str]:
@@ -233,6 +248,34 @@ def pages_with_commands() -> list[Path]:
 def test_a_page_runs_from_top_to_bottom(path, tmp_path):
     BEFORE.get(place(path), lambda folder: None)(tmp_path)
     follow(path, tmp_path)
+
+
+IN_PLACE = {"mergenet": "moment", "out/mine": "moment", "moment,mergenet,out/mine": "naive,moment"}
+LEFT_OUT = ("generate", "train")
+
+
+def test_a_camera_is_read_measured_and_restored(tmp_path, monkeypatch, capsys):
+    """From raw bytes to video with time stamps: hot pixels are found by the darks and filled, rates are printed."""
+    monkeypatch.chdir(tmp_path)
+    hot = write_recordings(tmp_path)
+    mains = {"qsim": qsim.cli.program.main, "quiver": quiver.cli.program.main}
+    ran = []
+    for program, command, *words in commands(ROOT / "docs" / "spad_camera.md"):
+        if command in LEFT_OUT:
+            continue
+        if "--sensor" in words and "\n[defects]" not in (text := Path("out/spad.toml").read_text()):
+            Path("out/spad.toml").write_text(f'{text}\n[defects]\ndark_map = "spad_dark.npy"\n')  # printf of the page
+        words = [IN_PLACE.get(word, word) for word in words]
+        assert mains[program]([command, *words]) == 0, shlex.join([program, command, *words])
+        ran.append(command)
+    assert set(ran) == {"convert", "preview", "calibrate", "restore", "evaluate"}
+    np.testing.assert_array_equal(np.load("out/spad_hot.npy"), hot)
+    said = capsys.readouterr()
+    assert "7 planes per code, 10000 planes/s, 1428.57 codes/s" in said.out
+    assert f"{hot.sum()} of {hot.size} pixels defective and filled" in said.err
+    found = json.loads(Path("out/video.json").read_text())
+    assert found["shape"] == [40, *hot.shape]
+    np.testing.assert_allclose(found["times"]["values"], (70 + 3.5 + 7 * np.arange(40)) * 1e-4)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "scenes").glob("*.toml")), ids=place)
