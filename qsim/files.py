@@ -118,10 +118,27 @@ def _replacing(*paths: Path) -> Iterator[Sequence[BinaryIO]]:
         for file in opened:
             file.flush()
             os.fsync(file.fileno())
-        for path in paths[1:]:
-            path.unlink(missing_ok=True)
-        for part, path in zip(parts, paths, strict=True):
-            os.replace(part, path)
+        scratch.name(*zip(parts, paths, strict=True))
+    sync_folder(paths[0].parent)
+
+
+@contextlib.contextmanager
+def replacing_together(*paths: Path) -> Iterator[tuple[Path, ...]]:
+    """Return paths for files that describe one another, of the same names in a folder of their own.
+
+    Those that the block makes appear together at its end, the descriptions last; also if this process is killed then:
+    the next command that writes there gives them their names.
+    """
+    with naming(paths[0]), Scratch(paths[0]) as scratch:
+        place = scratch.new()
+        place.mkdir()
+        parts = tuple(place / path.name for path in paths)
+        yield parts
+        made = [(part, path) for part, path in zip(parts, paths, strict=True) if part.is_file()]
+        for part, _ in made:
+            with open(part, "rb") as file:
+                os.fsync(file.fileno())
+        scratch.name(*made)
     sync_folder(paths[0].parent)
 
 

@@ -1,13 +1,14 @@
 """Keeps what a writer has not finished in a folder that is provably its own, beside the output.
 
-    .qsim-TOKEN/record.json   the token again; locked while the writer lives
+    .qsim-TOKEN/record.json   the token again; locked while the writer lives. Once all new files are complete, also
+                              their outputs, which a killed writer had still to name
     .qsim-TOKEN/0, 1          new files or folders, which are renamed to their output when they are complete
     .qsim-TOKEN/old           a folder that was replaced, until it is deleted
 
 TOKEN is 128 random bits and the folder is made exclusively, so no file or link of anybody lies under its names. Of a
-writer that was killed, `sweep` deletes the folder: only if its record states the folder's own token, its lock is free,
-this user owns it, and it holds nothing but these names. A writer that was killed before it wrote its record left an
-empty folder, or one with an empty record. Whatever else looks like it stays.
+writer that was killed, `sweep` gives complete files their names and deletes the folder: only if its record states the
+folder's own token, its lock is free, this user owns it, and it holds nothing but these names. A writer that was killed
+before it wrote its record left an empty folder, or one with an empty record. Whatever else looks like it stays.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import re
 import secrets
 import shutil
 import stat
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -27,12 +29,13 @@ try:
 except ModuleNotFoundError:
     raise ImportError("qsim runs on Linux and macOS: it locks files by fcntl, which this system lacks") from None
 
+PREFIX = ".qsim-"
 RECORD = "record.json"
 OLD = "old"
 _NEW = re.compile(r"[0-9]{1,3}")
 _FOLDER = re.compile(r"\.qsim-([0-9a-f]{32})")
 _EXCLUSIVE = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
-_LARGEST_RECORD = 1 << 12  # bytes
+_LARGEST_RECORD = 1 << 16  # bytes
 
 
 class Scratch:
@@ -50,7 +53,7 @@ class Scratch:
     def _made(self) -> bool:
         """Make the folder and its record, locked; return False if they were taken for those of a killed writer."""
         token = secrets.token_hex(16)
-        self.folder = self._parent / f".qsim-{token}"
+        self.folder = self._parent / f"{PREFIX}{token}"
         os.mkdir(self.folder, 0o700)
         try:
             lock = os.open(self.folder / RECORD, _EXCLUSIVE, 0o600)
@@ -85,6 +88,19 @@ class Scratch:
     def new(self, number: int = 0) -> Path:
         """Return the name of a new file or folder, which the caller makes, completes and renames."""
         return self.folder / str(number)
+
+    def name(self, *outputs: tuple[Path, Path]) -> None:
+        """Rename complete and synced new files, (file, output) each, all of them even if this process is killed.
+
+        The outputs lie beside the folder, and all but the first describe those before them: old ones are deleted first,
+        so that a description which exists describes what is there.
+        """
+        moves = [(str(new.relative_to(self.folder)), output.name, _state(output)) for new, output in outputs]
+        if self._lock is not None:
+            record = {"software": "qsim", "token": self.folder.name.removeprefix(PREFIX), "moves": moves}
+            os.pwrite(self._lock, json.dumps(record).encode(), 0)
+            os.fsync(self._lock)
+        _finish(self.folder, [(new, name) for new, name, _ in moves])
 
     @property
     def old(self) -> Path:
@@ -125,7 +141,9 @@ def _sweep(folder: Path) -> None:
         if not stat.S_ISREG(os.fstat(lock).st_mode):
             return
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # an error while its writer lives
-        if _is_proven(folder, os.read(lock, _LARGEST_RECORD)):
+        record = os.read(lock, _LARGEST_RECORD)
+        if _is_proven(folder, record):
+            _finish(folder, _moves_of(folder, record))
             _delete(folder)
     finally:
         os.close(lock)
@@ -142,6 +160,36 @@ def _is_proven(folder: Path, record: bytes) -> bool:
         return False
     ours = isinstance(found, dict) and f".qsim-{found.get('token')}" == folder.name
     return ours and all(name in (RECORD, OLD) or _NEW.fullmatch(name) for name in names)
+
+
+def _state(output: Path) -> list[int]:
+    """Return what tells a file from another of its name; empty if there is none."""
+    try:
+        found = os.lstat(output)
+    except FileNotFoundError:
+        return []
+    return [found.st_ino, found.st_mtime_ns]
+
+
+def _moves_of(folder: Path, record: bytes) -> list[tuple[str, str]]:
+    """Return (file in the folder, name of its output) of what a killed writer had completed and not named.
+
+    Empty if an output is another file than it was then: somebody else's.
+    """
+    found = json.loads(record).get("moves", []) if record else []
+    left = [(new, name, state) for new, name, state in found if (folder / new).is_file()]
+    named = all(Path(name).name == name and ".." not in Path(new).parts for new, name, _ in left)
+    same = all(_state(folder.parent / name) in ([], state) for _, name, state in left)
+    return [(new, name) for new, name, _ in left] if named and same else []
+
+
+def _finish(folder: Path, moves: Sequence[tuple[str, str]]) -> None:
+    """Name the files that have no name yet."""
+    left = [(folder / new, folder.parent / name) for new, name in moves if (folder / new).is_file()]
+    for _, output in left[1:]:
+        output.unlink(missing_ok=True)
+    for new, output in left:
+        os.replace(new, output)
 
 
 def _delete(folder: Path) -> None:

@@ -324,13 +324,14 @@ def beside(path: Path) -> dict[str, Path]:
 def write(found: Calibration, path: Path, title: str) -> list[Path]:
     """Write all files of a calibration, the sensor file last; return their paths."""
     names = beside(path)
-    written = [names["values"], names["plot"]]
-    files.write_json(names["values"], as_dict(found))
-    files.write_bytes(names["plot"], figure(found))
-    for name, kind in (("dark_count_rate", np.float32), ("hot_pixels", np.bool_)):
-        if name in found.maps:
-            with files.replacing(names[name]) as file:
+    maps = [name for name in ("dark_count_rate", "hot_pixels") if name in found.maps]
+    written = [names["values"], names["plot"], *(names[name] for name in maps), path]
+    with files.replacing_together(*written) as (values, plot, *arrays, text):
+        files.write_json(values, as_dict(found))
+        files.write_bytes(plot, figure(found))
+        for name, array in zip(maps, arrays, strict=True):
+            kind = np.float32 if name == "dark_count_rate" else np.bool_
+            with files.replacing(array) as file:
                 np.save(file, found.maps[name].astype(kind))
-            written.append(names[name])
-    files.write_bytes(path, to_toml(found, title, path.stem).encode())
-    return [*written, path]
+        files.write_bytes(text, to_toml(found, title, path.stem).encode())
+    return written

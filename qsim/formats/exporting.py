@@ -53,8 +53,9 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     for place in [path, *([side] if single else [])]:
         _check_ours(place, side if single else place / "meta.json", single)
     if single:
-        EXPORTS[wanted.kind](source, path, wanted, meta)
-        files.write_json(side, meta)
+        with files.replacing_together(path, side) as (made, described):
+            EXPORTS[wanted.kind](source, made, wanted, meta)
+            files.write_json(described, meta)
         return path
     with files.naming(path), scratch.Scratch(path) as unfinished:
         part = unfinished.new()

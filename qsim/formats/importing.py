@@ -18,6 +18,7 @@ from typing import Any, cast
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import scratch
 from qsim.checks import file_path
 from qsim.clip import exr
 from qsim.clip.clip_info import ClipInfo, Saturation
@@ -265,6 +266,7 @@ def _check_stream(path: Path, recording: Recording, capture: Import) -> None:
 def free_stream(path: Path, force: bool) -> Path:
     """Return the file of a stream's codes; `FileExistsError` if it or its description exists and is not replaced."""
     check_outside(path)
+    scratch.sweep(path.parent)
     stem = path.with_suffix("") if path.suffix in (".npy", ".json") else path
     npy, description = (stem.with_name(f"{stem.name}{end}") for end in (".npy", ".json"))  # a stem may hold dots
     for file in (npy, description):

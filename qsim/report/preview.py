@@ -87,19 +87,20 @@ def write(
 ) -> None:
     """Write PNG (the first of `frames`), GIF or mp4 by the suffix of `path`, and a sidecar with `about` and the scales.
 
-    Both are written atomically.
+    Both appear together.
     """
     declared = {"format": "qsim-preview-1", "curve": CURVE, "views": [declaration(view) for view in page.views]}
     drawn = _drawn(page, frames, progress)
-    if path.suffix == ".png":
-        _write_png(path, next(drawn), declared)
-    elif path.suffix == ".gif":
-        _write_gif(path, drawn, fps)
-    else:
-        from qsim.formats.video import write_video
+    with files.replacing_together(path, sidecar(path)) as (made, described):
+        if path.suffix == ".png":
+            _write_png(made, next(drawn), declared)
+        elif path.suffix == ".gif":
+            _write_gif(made, drawn, fps)
+        else:
+            from qsim.formats.video import write_video
 
-        write_video(path, drawn, fps, lossless=False)
-    files.write_json(sidecar(path), declared | about)
+            write_video(made, drawn, fps, lossless=False)
+        files.write_json(described, declared | about)
 
 
 def sidecar(path: Path) -> Path:

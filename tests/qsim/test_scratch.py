@@ -35,6 +35,57 @@ def test_a_killed_writer_is_swept_by_the_next(tmp_path: Path):
     assert (tmp_path / "a.json").read_text() == "before"
 
 
+def killed_while_naming(folder: Path) -> None:
+    """Leave the scratch folder of a process that was killed after it had named the first of three new files."""
+
+    def write() -> None:
+        rename = os.replace
+
+        def once(new: Path, output: Path) -> None:
+            rename(new, output)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        os.replace = once
+        with files.replacing_together(*(folder / name for name in "abc")) as parts:
+            for part in parts:
+                part.write_text("new")
+
+    os.waitpid(forked(write), 0)
+
+
+@pytest.mark.parametrize("names", ["", "a", "abc"], ids=["new", "one", "all"])
+def test_files_that_belong_together_are_named_together(tmp_path: Path, names: str):
+    for name in names:
+        (tmp_path / name).write_text("old")
+    killed_while_naming(tmp_path)
+    assert (tmp_path / "a").read_text() == "new"
+    assert not (tmp_path / "c").exists()  # no description of what is not there
+    sweep(tmp_path)
+    assert sorted(os.listdir(tmp_path)) == ["a", "b", "c"]
+    assert {(tmp_path / name).read_text() for name in "abc"} == {"new"}
+
+
+def test_a_file_that_somebody_put_there_meanwhile_stays(tmp_path: Path):
+    killed_while_naming(tmp_path)
+    (tmp_path / "b").write_text("precious")
+    sweep(tmp_path)
+    assert sorted(os.listdir(tmp_path)) == ["a", "b"]
+    assert (tmp_path / "b").read_text() == "precious"
+
+
+@pytest.mark.parametrize("name", ["../a", "/a", "x/a", ".."])
+def test_a_record_names_only_files_beside_it(tmp_path: Path, name: str):
+    place = tmp_path / "x"
+    place.mkdir()
+    killed_while_naming(place)
+    (left,) = (item for item in place.iterdir() if item.name.startswith(".qsim-"))
+    record = json.loads((left / RECORD).read_text())
+    record["moves"] = [["0/b", name, []]]
+    (left / RECORD).write_text(json.dumps(record))
+    sweep(place)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", "x"]
+
+
 def disguises(left: Path) -> dict[str, Path]:
     """Return folders and links of a user that look like what a killed writer left, each with a precious file."""
     made = {}
