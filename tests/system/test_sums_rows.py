@@ -29,11 +29,24 @@ def test_the_noise_of_the_reference_is_not_in_an_error():
 
 
 def test_the_page_compares_codes_with_sharp_frames():
-    side = {"samples": 8, "sharp_samples": 0, "denoise": True, "processor_seconds": 0.5, "reached": [40.0, 41.0]}
-    summed = side | {"samples": 2, "sharp_samples": 8, "processor_seconds": 1.0, "stated": [39.0, 39.0]}
+    side = {
+        "samples": 8,
+        "sharp_samples": 0,
+        "denoise": True,
+        "processor_seconds": 0.5,
+        "reached": [40.0, 41.0],
+        "neighbours": 0,
+    }
+    summed = side | {
+        "samples": 2,
+        "sharp_samples": 8,
+        "processor_seconds": 1.0,
+        "stated": [39.0, 39.0],
+        "light_seconds": 0.75,
+    }
     page = sums_rows.table({"fan": {"sharp": side, "summed": summed, "quiet": False}})
-    assert "| fan \\* | 8, denoised | 0.50 | 2, denoised | 8 | 1.00 | 2.00 | 40.5 | 40.5 | 39.0 |" in page
-    assert "Median ratio of 1 rows: 2.00." in page
+    assert "| fan \\* | 8, denoised | 0.50 | 2, denoised | 8 | 1.00 | 2.00 | 1.50 | 40.5 | 40.5 | 39.0 |" in page
+    assert "Median ratio of 1 rows: 2.00;" in page
 
 
 def test_an_unknown_family_is_one_sentence(capsys, tmp_path):

@@ -1,5 +1,6 @@
 """Generation with the real renderer: killed and resumed from the command line, it gives the same bytes."""
 
+import json
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import fakes
 import pytest
 from fakes import tree
 
+from qsim import cli
 from qsim.dataset.dataset import Dataset
 
 RECIPE = fakes.RECIPE.replace("height = 8\nwidth = 10\n", "height = 24\nwidth = 32\npsnr = 25.0\n")
@@ -49,3 +51,40 @@ def test_a_killed_generation_resumes_to_the_same_bytes(tmp_path: Path):
         for name in clip.streams:
             stream = clip.stream(name)
             assert stream.info.sensing.ppp * 0.5 < stream.codes().mean() / stream.sensor.gain / 0.8 * 2
+
+
+PLANES = """
+[recipe]
+name = "planes"
+frames = 9
+height = 24
+width = 32
+frame_rate = 10000.0
+psnr = 25.0
+[[scenes]]
+family = "plain"
+[[streams]]
+sensor = "spad512s"
+bits = 2
+group = true
+ppp = {ppp}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("ppp", "limit"), [(0.5, "25 dB"), (400.0, "400 PPP")])
+def test_a_recipe_of_sums_renders_codes_and_names_the_limit(tmp_path: Path, capsys, ppp, limit):
+    """Three planes share the noise of a code, and the plan states the same limit."""
+    recipe = tmp_path / "planes.toml"
+    recipe.write_text(PLANES.format(ppp=ppp))
+    assert cli.main(["generate", str(recipe), "-o", str(tmp_path / "set"), "--workers", "0", "-q"]) == 0
+    assert f"the samples follow from {limit} in 1 clip" in capsys.readouterr().out
+    (clip,) = Dataset.open(tmp_path / "set").clips()
+    assert clip.info.render is not None
+    assert (clip.info.render.planes, clip.info.render.codes) == (3, (3,))
+    assert len(clip.info.error_per_code) == 3
+    assert clip.info.psnr_of_truth >= 24.5
+    assert [clip.info.has("sharp", t) for t in range(9)] == [False, True, False] * 3
+    assert cli.main(["plan", str(recipe), "--json", "-q"]) == 0
+    (kind,) = json.loads(capsys.readouterr().out)["kinds"]
+    assert (kind["planes"], kind["limits"]) == (3, [limit])
