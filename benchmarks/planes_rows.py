@@ -1,8 +1,8 @@
 """Measures what codes that sum planes cost, over sharp frames with the same asked error, and the error of their light.
 
-    python benchmarks/sums_rows.py                             # six families at 240 x 320: an hour on one core
-    python benchmarks/sums_rows.py --rows fan,lamp --busy      # these alone, beside other programs
-    python benchmarks/sums_rows.py --tiny --out out/rows       # seconds: a test of this program
+    python benchmarks/planes_rows.py                             # six families at 240 x 320: an hour on one core
+    python benchmarks/planes_rows.py --rows fan,lamp --busy      # these alone, beside other programs
+    python benchmarks/planes_rows.py --tiny --out out/rows       # seconds: a test of this program
 
 A row is RESULTS/FAMILY-SIZE.json. It is written when it is complete, and made once; only missing ones are made. Per
 row, in one process: a clip of sharp frames at the rate of the codes, and a clip of their planes, each with its own
@@ -197,7 +197,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     text = [
         "# Codes that sum planes",
         "",
-        "Made by `python benchmarks/sums_rows.py`, which says how. Processor seconds of a sharp frame, and of a code",
+        "Made by `python benchmarks/planes_rows.py`, which says how. Processor seconds of a sharp frame, and of a code",
         "with its sharp frame in the middle, ground truth of all frames and storing included. Both have the same asked",
         "PSNR. Samples are per pixel and frame. Errors are those of the light of a frame and of a code, in dB below",
         "white; a code states the larger of the errors of its light and of its sharp frame.",
@@ -223,7 +223,7 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--rows", default=",".join(FAMILIES), help="families, separated by commas (default: all)")
     parser.add_argument("--size", default="240x320", help="HEIGHTxWIDTH in px (default 240x320)")
     parser.add_argument("--planes", type=int, default=Plan.planes, help=f"in a code (default {Plan.planes})")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "sums", help="folder of the rows")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "planes", help="folder of the rows")
     parser.add_argument("--busy", action="store_true", help="also beside other programs; such rows are marked")
     parser.add_argument("--tiny", action="store_true", help="few and small frames: a test of this program")
     args = parser.parse_args(words)
@@ -232,14 +232,14 @@ def main(words: list[str] | None = None) -> int:
     if args.tiny:
         plan = Plan(24, 32, 3, codes=3, rendered=3, level=25.0, reference=48)
     try:
-        keep_apart("sums", args.out, trial=args.tiny)
+        keep_apart("planes", args.out, trial=args.tiny)
         args.out.mkdir(parents=True, exist_ok=True)
         for family in args.rows.split(","):
             more = "" if plan.planes == Plan.planes else f"-{plan.planes}"
             path = args.out / f"{family}-{plan.height}x{plan.width}{more}.json"
             grow(path, plan, partial(measure, family, plan), table, busy=args.busy or args.tiny)
     except ValueError as error:
-        print(f"sums_rows: {error}", file=sys.stderr)
+        print(f"planes_rows: {error}", file=sys.stderr)
         return 2
     return 0
 
