@@ -46,7 +46,7 @@ def _fitting_filters(clip: ClipFolder, sensing: Sensing, recorded: bool) -> Colo
 def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sensor | None = None) -> Draw:
     """Return the draw of a clip as `prepare`, with given defects. A given sensor `own` has no file and no filters."""
     filters = _fitting_filters(clip, sensing, own is not None)
-    planes = sensing.planes
+    planes = own.levels - 1 if own is not None and sensing.group else sensing.planes
     if sensing.group and sensing.depth is None:
         raise ValueError(f"{clip.name}: group= sums planes, and needs the bits of a code, as in bits=3")
     if not 1 <= planes <= len(clip):

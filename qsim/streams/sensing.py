@@ -163,7 +163,11 @@ class Sensing:
     @property
     def planes(self) -> int:
         """The clip frames in a code: planes that are summed, or slices of an exposure."""
-        return 2 ** (self.depth or 1) - 1 if self.group else self.slices
+        if not self.group:
+            return self.slices
+        if isinstance(self.sensor, Sensor) and self.sensor.sums_planes:
+            return self.sensor.levels - 1
+        return 2 ** (self.depth or 1) - 1
 
     @property
     def depth(self) -> int | None:

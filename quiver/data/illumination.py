@@ -75,7 +75,7 @@ class Illumination:
         """Return the light and the noise of a stored stream. `ValueError` if training windows cannot have it."""
         refuse_others(unlike_windows(stream), str(stream.path.with_suffix(".json")))
         info = stream.info
-        named = info.sensor_name != "" and not info.sensor_name.endswith(".toml")
+        named = info.sensor_name != "" and not info.sensor_name.endswith(".toml") and "summed" not in info.sensor
         settings = {name: value for name, value in info.settings.items() if name in HONOURED}
         settings.pop("temperature", None)  # the record has its dark rate
         pitched = settings.pop("pixel_pitch", None) is not None
@@ -138,6 +138,8 @@ class Illumination:
     @property
     def planes(self) -> int:
         """Clip frames of a code."""
+        if self.sensing.group and self.record is not None:
+            return self.device(5e-4).levels - 1
         return self.sensing.planes
 
     @property
@@ -156,16 +158,17 @@ class Illumination:
         if planes == 1 or not self.device(5e-4).sums_planes:
             return self.but(group=False, slices=planes)
         depth = planes.bit_length()
-        if planes != 2**depth - 1:
-            near = f"{2 ** (depth - 1) - 1} or {2**depth - 1}"
-            raise ArgumentError("planes", f"a b-bit code sums 2^b - 1 planes, got {planes}; give {near}")
         fixed = bits if self.record is None else self.bits
         if fixed not in (None, depth):
             raise ArgumentError(
                 "planes",
                 f"a sum of {planes} planes has {depth} bits, and {fixed} are asked for; give planes= or bits= alone",
             )
-        return self.but(group=True, slices=1, bits=depth)
+        made = self.but(group=True, slices=1, bits=depth)
+        if planes == 2**depth - 1 and self.record is None:
+            return made
+        made = made.stated()
+        return replace(made, record=as_text(made.device(5e-4).of_planes(planes).to_dict()))
 
     def timed_as(self, other: Illumination) -> Illumination:
         """Return the same with rows, shares and drift of another noise."""
@@ -278,7 +281,8 @@ def unlike_windows(stream: Stream) -> list[str]:
     """Return the settings of a stored stream that training windows cannot have."""
     unlike = [name for name in stream.info.settings if name not in (*HONOURED, *STATED)]
     stated = replace(stream.info.sensing, bits=stream.info.bits)
-    if stream.timing != stated.timing(stated.planes, stated.group):
+    planes = stream.sensor.levels - 1 if stated.group else stated.planes
+    if stream.timing != stated.timing(planes, stated.group):
         unlike.append(f"codes of {stream.info.planes_per_code} clip frames that its settings do not state")
     return unlike
 

@@ -50,8 +50,8 @@ class Case:
         planes = rng.choice([1, 2, 3, 7])
         model = rng.choice(["sum", "sum", "qis", "counter"])
         if model == "sum":
-            planes = rng.choice([1, 3, 7])
-            sensor: Sensor = BinarySPAD(0.6, 300.0, bits=planes.bit_length())
+            planes = rng.choice([1, 2, 3, 5, 7])
+            sensor: Sensor = BinarySPAD(0.6, 300.0, planes.bit_length(), planes)
         elif model == "qis":
             sensor = QIS(0.8, 40.0, 0.3, rng.choice([1, 3, 10]))
         else:
@@ -114,7 +114,7 @@ class Case:
         """Codes and the photons of their exposures, [T, H, W] each, from a loop over codes and their exposures."""
         sensor = self.sensing.sensor
         assert isinstance(sensor, Sensor)
-        single = replace(sensor, bits=1) if self.summed else sensor
+        single = replace(sensor, bits=1, summed=None) if self.summed else sensor
         codes = []
         photons = []
         for t in range(self.codes):
