@@ -111,7 +111,7 @@ class Illumination:
         texts = {name: None if table is None else as_text(table) for name, table in stated.items()}
         made = cls(sensing, **texts)
         if made.record is not None:
-            made.device(5e-4)
+            replace(made, defects=None).device(5e-4)  # checks the record; maps of defects may lie elsewhere
         return made
 
     def to_dict(self) -> dict[str, Any]:

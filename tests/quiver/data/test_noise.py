@@ -226,3 +226,13 @@ def test_any_value_in_the_settings_of_a_run(data, tmp_path, name, share):
             refused.append(str(error))
     assert refused or name in ("sensor", "ppp", "bits")  # those are what was asked for; `noise` is what counts
     assert all("\n" not in text and len(text) < 1500 for text in refused)
+
+
+def test_the_noise_of_weights_is_read_where_its_maps_are_not(tmp_path):
+    """Weights go on without the maps of the camera that they were trained for: no codes are drawn."""
+    np.save(tmp_path / "dark.npy", np.ones((4, 5), np.float32))
+    text = '[sensor]\nmodel = "BinarySPAD"\npde = 0.5\ndark_count_rate = 10.0\n[defects]\ndark_map = "dark.npy"\n'
+    (tmp_path / "own.toml").write_text(text)
+    stated = Illumination.of(str(tmp_path / "own.toml"), 3.25, 3).stated()
+    (tmp_path / "dark.npy").unlink()
+    assert Illumination.from_dict(json.loads(json.dumps(stated.to_dict()))) == stated
