@@ -24,6 +24,7 @@ SLOW = (  # 4 to 25 s of processor time; the others up to 3 s
     "pytorch",
     "readouts",
     "restoring",
+    "spad_camera",
     "training",
 )
 
