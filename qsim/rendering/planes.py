@@ -11,8 +11,9 @@ raw one, pixel by pixel:
 The planes keep their motion, are not negative, and their mean is the cleaned one. The error of a plane against its
 truth follows from its own halves, as in reuse/choice.py: (F - M)^2 + (F_A - F_B)(A - B) / 2 - (A - B)^2 / 4 on average.
 
-What this does to the noise: a plane has about sqrt(planes) times the error of a code, and what is left after the mean
-sums to zero over the planes. Codes that begin elsewhere, and rows with their own time, average it less.
+What this does to the noise: a plane has sqrt(planes) times the error of a code, and more where the mean is cleaned.
+What is left after the mean sums to zero over the planes. Codes that begin elsewhere average it less. A binary plane is
+not linear: noise of s photons lowers its mean count as s^2 / 2 photons less light would.
 """
 
 from __future__ import annotations
