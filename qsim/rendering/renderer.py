@@ -125,6 +125,12 @@ class Renderer:
             self._whole = self.window((0, 0, scene.camera.height, scene.camera.width))
             self._carrier = self._whole.carrier(self.budget, frames)
 
+    def __copy__(self) -> Renderer:
+        """Return another renderer of the same loaded scene."""
+        other = object.__new__(Renderer)
+        vars(other).update(vars(self))
+        return other
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how to make it again, for pickles and deep copies: Mitsuba's objects cannot be copied."""
         given: dict[str, Any] = {
