@@ -103,7 +103,7 @@ class CodeTruth:
         return self.clip.body_id(self.exposures.middle_frame(t))
 
     def motion(self, t: int) -> tuple[Array, Array]:
-        """Return `flow` and `valid` of code t."""
+        """Return `flow` [2, H, W] and `valid` [H, W] of code t."""
         shape = self.clip.shape[1:]
         first = self.exposures.middle_frame(t)
         last = first + self.timing.frames

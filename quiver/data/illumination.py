@@ -155,9 +155,11 @@ class Illumination:
         """
         if planes is None:
             return self
+        depth = planes.bit_length()
+        if self._leaves_bits_to_sums:
+            return self.but(bits=depth).over(planes, bits)
         if planes == 1 or not self.device(5e-4).sums_planes:
             return self.but(group=False, slices=planes)
-        depth = planes.bit_length()
         fixed = bits if self.record is None else self.bits
         if fixed not in (None, depth):
             raise ArgumentError(
@@ -169,6 +171,15 @@ class Illumination:
             return made
         made = made.stated()
         return replace(made, record=as_text(made.device(5e-4).of_planes(planes).to_dict()))
+
+    @property
+    def _leaves_bits_to_sums(self) -> bool:
+        """Whether the sensor is a file of a clocked pixel without bits, which serves sums of any number of planes."""
+        if self.record is not None or self.bits is not None:
+            return False
+        table = devices.table_of(self.sensor)
+        model = devices.MODELS.get(str(table.get("model")))
+        return model is not None and model.sums_planes and "bits" not in table
 
     def timed_as(self, other: Illumination) -> Illumination:
         """Return the same with rows, shares and drift of another noise."""

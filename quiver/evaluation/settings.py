@@ -75,7 +75,7 @@ class EvaluateSettings:
     static: Annotated[
         Path | None,
         setting(
-            "photon counts [N,H,W] or [T,K,H,W], .npy or .npz; with --planes binary planes, of a stream or .npy",
+            "photon counts [N,H,W] or [T,K,H,W], .npy or .npz; or binary planes to sum, a stream or .npy",
             shown="COUNTS",
         ),
     ] = None

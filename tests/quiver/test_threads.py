@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -133,14 +134,14 @@ def test_a_run_keeps_its_number_unless_told_otherwise(tiny_dataset, tmp_path):
     def again(**told: int) -> int:
         torch.manual_seed(0)
         mine = Settings(str(tiny_dataset), str(tmp_path / "r"), steps=1, crop=16, batch=1, validation_windows=1, **told)
-        train(UNet(UNetConfig(1)), mine, progress=False)
+        with mock.patch.object(torch, "set_num_threads", wraps=torch.set_num_threads) as asked:
+            train(UNet(UNetConfig(1)), mine, progress=False)
         written = json.loads((tmp_path / "r/settings.json").read_text())["threads"]
-        assert written == torch.get_num_threads()
+        assert [call.args[0] for call in asked.call_args_list] == [written, 1]  # during the run, and after it
         return written
 
     torch.set_num_threads(1)
     assert again(threads=2) == 2
-    torch.set_num_threads(1)
     assert again() == 2
     assert again(threads=1) == 1
     with pytest.raises(ValueError, match="threads=1000000: this machine has"):

@@ -295,7 +295,10 @@ MISTAKES = [
         "quiver restore data/clips/fan_0000 -o x.npy --stream quiver-physical_3bit_3.25ppp --bits 1",
         "--bits: data/clips/fan_0000/streams/quiver-physical_3bit_3.25ppp.npy is a stored stream, which has its own",
     ),
-    ("quiver restore codes.npy -o x.npy --width 10 --planes 5", "only a clocked SPAD sums planes, this is a QIS"),
+    (
+        "quiver restore codes.npy -o x.npy --ppp 3 --width 80 --planes 2",
+        "only a clocked SPAD sums planes, this is a QIS",
+    ),
     ("quiver restore codes.npy -o x.npy --seed 1", "--seed: is for noise that is drawn, and codes.npy holds codes"),
     ("quiver restore lit -o x.npy --ppp 3 --width 8", "--width: describes a bare array, and lit is a clip; leave it"),
     (
