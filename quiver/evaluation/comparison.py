@@ -95,13 +95,23 @@ def truth_psnr(truth: CodeTruth, peak: float, codes: range) -> float | None:
     Errors are measured in radiance, to which photons are proportional.
     """
     clip = truth.clip
-    errors = clip.info.error_per_frame
-    if not errors or clip.mean_radiance <= 0:
+    info = clip.info
+    errors = (info.error_per_frame, info.error_per_code)
+    if not info.error_per_frame or clip.mean_radiance <= 0:
         return None
-    if peak <= peak_of(truth.mean_light, None) * (1 + 1e-6):
-        errors = clip.info.error_at_white_per_frame or errors
+    if info.error_at_white_per_frame and peak <= peak_of(truth.mean_light, None) * (1 + 1e-6):
+        errors = (info.error_at_white_per_frame, info.error_at_white_per_code)
+    planes = 1 if info.render is None else info.render.planes
     unit = truth.mean_light / clip.mean_radiance / peak
-    return metrics.truth_psnr([errors[truth.exposures.middle_frame(t)] * unit for t in codes])
+    middles = [truth.exposures.middle_frame(t) for t in codes]
+    return metrics.truth_psnr([_error_of_middle(*errors, middle, planes) * unit for middle in middles])
+
+
+def _error_of_middle(per_frame: Sequence[float], per_code: Sequence[float], middle: int, planes: int) -> float:
+    """Return the error of the sharp frame of a code: of planes that share noise, the middle has samples of its own."""
+    if per_code and middle % planes == planes // 2:
+        return per_code[middle // planes]
+    return per_frame[middle]
 
 
 @own_numbers

@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 from sensor_files import QIS, sensor_file
 
 from qsim import descriptions, files
-from qsim.clip.clip_info import RELATIVE
+from qsim.clip.clip_info import RELATIVE, RenderInfo
 from qsim.clip.writer import ClipWriter
 from qsim.optics.radiometry import RGB
 from qsim.streams.clip import Clip
@@ -239,6 +239,19 @@ def test_truth_psnr_is_the_radiance_error_in_units_of_white(make_clip: ClipMaker
     half = -20 * math.log10(0.005 * (3.25 / clip.mean_radiance) / 8.125)
     assert truth_psnr(halved, 8.125, range(4)) == pytest.approx(half)
     assert truth_psnr(halved, 16.25, range(4)) == truth_psnr(truth, 16.25, range(4))
+
+
+def test_truth_psnr_of_sums_is_that_of_their_sharp_middles(make_clip: ClipMaker):
+    """Frames of planes have ten times the noise of the sharp frame in the middle of a code."""
+    made = make_clip(relative=True, error=0.01)
+    clip = replace(made, info=replace(made.info, error_at_white_per_frame=()))
+    _, truth = sensed(clip, Illumination.of("spad-320x240", 3.25, None).over(3))
+    alone = truth_psnr(truth, 8.125, range(2))
+    codes = tuple(0.1 * error for error in clip.info.error_per_frame[1::3])
+    info = replace(clip.info, error_per_code=codes, render=RenderInfo(planes=3, codes=(3,)))
+    assert truth_psnr(replace(truth, clip=replace(clip, info=info)), 8.125, range(2)) == pytest.approx(alone + 20)
+    shifted = replace(info, render=RenderInfo(planes=5, codes=(5,)))  # codes that begin elsewhere have other middles
+    assert truth_psnr(replace(truth, clip=replace(clip, info=shifted)), 8.125, range(1)) < alone + 1
 
 
 def bright_clip(make_clip: ClipMaker, share: float, **options: object):
