@@ -27,6 +27,7 @@ from qsim.dataset.job_record import Failure, JobRecord, failure_path, record_pat
 from qsim.dataset.provenance import assets, origin, photographs
 from qsim.process import peak_memory
 from qsim.streams.clip import Clip
+from qsim.streams.sensing import sensor_of
 from qsim.streams.storing import sense
 
 if TYPE_CHECKING:
@@ -101,7 +102,6 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
     code. Streams in lux or with absolute light set no limit: their photons are known only after rendering.
     """
     from qsim.rendering import fidelity
-    from qsim.sensor import devices
     from qsim.sensor.file_laws import Conditions
 
     settings = job.settings
@@ -111,16 +111,10 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
     for sensing in job.streams:
         if sensing.ppp is not None:
             conditions = Conditions(sensing.temperature, scene.camera.wavelength)
-            sensor = devices.load(
-                sensing.sensor,
-                ppp=sensing.ppp,
-                bits=sensing.bits,
-                exposure=1 / settings.frame_rate,
-                conditions=conditions,
-            )
+            sensor = sensor_of(sensing, ppp=sensing.ppp, exposure=1 / settings.frame_rate, conditions=conditions)
             share = sensor.efficiency
-            of_frame = sensing.ppp / sensing.planes
-            of_code = max(of_code, of_frame * share * sensing.planes)
+            of_frame = sensing.ppp / sensing.frames
+            of_code = max(of_code, of_frame * share * sensing.frames)
             if of_frame * share > electrons:
                 electrons = of_frame * share
                 ppp = of_frame
@@ -146,7 +140,7 @@ def frames_together(sensing: Sensing) -> int:
     """
     if sensing.rows is not None or any(share != 1 for share in sensing.exposures or ()):
         return 1
-    return sensing.planes
+    return sensing.frames
 
 
 def removed(folder: Path) -> str:

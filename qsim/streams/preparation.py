@@ -18,7 +18,7 @@ from qsim.sensor.defects.pixel_array import PixelArray, require_effect
 from qsim.sensor.file_laws import Conditions
 from qsim.sensor.sensor import Sensor
 from qsim.streams.photons import light_level
-from qsim.streams.sensing import Sensing, filters_of, frames_needed
+from qsim.streams.sensing import Sensing, as_summed, filters_of, frames_needed, sensor_of
 from qsim.streams.simulation import Draw
 
 
@@ -46,7 +46,8 @@ def _fitting_filters(clip: ClipFolder, sensing: Sensing, recorded: bool) -> Colo
 def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sensor | None = None) -> Draw:
     """Return the draw of a clip as `prepare`, with given defects. A given sensor `own` has no file and no filters."""
     filters = _fitting_filters(clip, sensing, own is not None)
-    planes = own.levels - 1 if own is not None and sensing.group else sensing.planes
+    own = None if own is None else as_summed(own, sensing)
+    planes = own.levels - 1 if own is not None and sensing.group else sensing.frames
     if sensing.group and sensing.depth is None:
         raise ValueError(f"{clip.name}: group= sums planes, and needs the bits of a code, as in bits=3")
     if not 1 <= planes <= len(clip):
@@ -57,13 +58,7 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     ppp = None if sensing.ppp is None else sensing.ppp / planes
     level = light_level(clip, ppp=ppp, lux=sensing.lux, pixel_pitch=sensing.pixel_pitch)
     conditions = Conditions(sensing.temperature, _wavelength(clip), None if found is None else found.pattern.dark)
-    sensor = own or devices.load(
-        sensing.sensor,
-        ppp=level.ppp * planes,
-        bits=sensing.bits,
-        exposure=clip.exposure * planes,
-        conditions=conditions,
-    )
+    sensor = own or sensor_of(sensing, ppp=level.ppp * planes, exposure=clip.exposure * planes, conditions=conditions)
     if filters is not None and own is None:
         filters = _by_curve(filters, clip, sensing)
     if found is not None and sensor.keeps_charge:

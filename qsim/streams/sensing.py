@@ -10,9 +10,11 @@ from typing import Annotated
 from qsim import files, records
 from qsim.files import check_name
 from qsim.kinds import Bits, Frames, Light, Name, Number, Positive, Rise, RowOrder, Schedule, Seed, Text
+from qsim.plane_sums import Summed
 from qsim.sensor import colour_filter, devices
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.file_laws import Conditions
 from qsim.sensor.sensor import Sensor
 from qsim.settings import setting
 from qsim.streams.exposures import Timing
@@ -48,6 +50,9 @@ class Sensing:
         Name | None, setting("name of the stream", unset="made from sensor, bits and light", short="o", example="dim")
     ] = None
     group: Annotated[bool, setting("sum 2^bits - 1 clip frames, as binary planes, to one code")] = False
+    planes: Annotated[
+        Summed | None, setting("clocked SPAD: sum so many clip frames, as binary planes, to one code", example=10)
+    ] = None
     diffraction: Annotated[bool, setting("blur light with the lens's Airy pattern")] = False
     defects: Annotated[
         Text | Defects | None,
@@ -119,6 +124,11 @@ class Sensing:
         records.settle(self)
         if self.ppp is not None and self.lux is not None:
             raise ValueError("give the light level as ppp or as lux, not both")
+        if self.planes is not None:
+            object.__setattr__(self, "group", True)
+            if self.bits not in (None, self.planes.bit_length()):
+                depth = self.planes.bit_length()
+                raise ValueError(f"planes={self.planes}: their sum has {depth} bits, not {self.bits}; leave bits= out")
         if self.group and self.slices != 1:
             raise ValueError("group sums planes, slices are of one exposure; give one of them")
         if self.row_order is not None and self.row_delay is None:
@@ -145,6 +155,8 @@ class Sensing:
             light = f"{self.lux:g}lx"
         light = light.replace("e+", "e")  # a name holds no +
         bits = "" if self.depth is None else f"_{self.depth}bit"
+        if self.planes is not None and self.planes != 2 ** self.planes.bit_length() - 1:
+            bits += f"_{self.planes}planes"
         seed = f"_seed{self.seed}" if self.seed else ""
         sensor = Path(self.sensor_name).name.removesuffix(".toml")
         if isinstance(self.colour, str):
@@ -161,10 +173,12 @@ class Sensing:
         return type(self.sensor).__name__ if isinstance(self.sensor, Sensor) else self.sensor
 
     @property
-    def planes(self) -> int:
+    def frames(self) -> int:
         """The clip frames in a code: planes that are summed, or slices of an exposure."""
         if not self.group:
             return self.slices
+        if self.planes is not None:
+            return self.planes
         if isinstance(self.sensor, Sensor) and self.sensor.sums_planes:
             return self.sensor.levels - 1
         return 2 ** (self.depth or 1) - 1
@@ -174,9 +188,30 @@ class Sensing:
         """The bits of a code, as requested, of a record, or of the file of a sum of planes; None: the device's own."""
         if self.bits is not None:
             return self.bits
+        if self.planes is not None:
+            return self.planes.bit_length()
         if isinstance(self.sensor, Sensor):
             return self.sensor.bits
         return devices.load(self.sensor, ppp=1.0).bits if self.group and self.sensor.endswith(".toml") else None
+
+
+def sensor_of(sensing: Sensing, *, ppp: float | None, exposure: float, conditions: Conditions) -> Sensor:
+    """Return the sensor whose codes are drawn, in so many photons per pixel and code and of an exposure [s]."""
+    bits = sensing.bits
+    if sensing.planes is not None:
+        bits = devices.plane_bits(sensing.sensor, sensing.planes, bits)
+    made = devices.load(sensing.sensor, ppp=ppp, bits=bits, exposure=exposure, conditions=conditions)
+    return as_summed(made, sensing)
+
+
+def as_summed(sensor: Sensor, sensing: Sensing) -> Sensor:
+    """Return a sensor with codes of the planes that are asked for; `ValueError` for one that sums none."""
+    if sensing.planes is None:
+        return sensor
+    if not sensor.sums_planes:
+        kind = type(sensor).__name__
+        raise ValueError(f"{sensing.sensor_name}: planes= is for a clocked SPAD (BinarySPAD), this is a {kind}")
+    return sensor.plane.of_planes(sensing.planes)
 
 
 def filters_of(sensing: Sensing) -> ColourFilter | None:
@@ -189,4 +224,4 @@ def filters_of(sensing: Sensing) -> ColourFilter | None:
 def frames_needed(sensing: Sensing, height: int, width: int, frame_rate: float) -> int:
     """Return the clip frames of the first code: its planes or slices, and those that its last row still needs."""
     rows = sensing.rows
-    return sensing.planes + (0 if rows is None else rows.reach(height, width, frame_rate))
+    return sensing.frames + (0 if rows is None else rows.reach(height, width, frame_rate))

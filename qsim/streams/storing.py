@@ -105,7 +105,7 @@ def sense(
     line += draw.timing.words()
     line += draw.exposures(clip).about_flicker(clip.strengths)
     if draw.timing.rows is None and draw.planes % 2 == 0:
-        line += "; its truth is half a clip frame late, which an odd number of slices avoids"
+        line += "; its truth is half a clip frame late, which an odd number of clip frames avoids"
     if draw.defects is not None:
         effects = [key for key, value in draw.defects.to_dict().items() if value and key != "device_seed"]
         line += f"; defects: {', '.join(effects) or 'none'}"

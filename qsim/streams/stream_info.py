@@ -23,7 +23,7 @@ from qsim.sensor.sensor import Sensor
 from qsim.settings import given
 from qsim.streams.sensing import Sensing
 
-_ELSEWHERE = ("sensor", "bits", "name", "defects", "colour")  # settings whose outcome the description holds
+_ELSEWHERE = ("sensor", "bits", "planes", "name", "defects", "colour")  # settings whose outcome the description holds
 
 
 @dataclass(frozen=True, kw_only=True)

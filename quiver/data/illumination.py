@@ -140,7 +140,7 @@ class Illumination:
         """Clip frames of a code."""
         if self.sensing.group and self.record is not None:
             return self.device(5e-4).levels - 1
-        return self.sensing.planes
+        return self.sensing.frames
 
     @property
     def timing(self) -> Timing:
@@ -292,7 +292,7 @@ def unlike_windows(stream: Stream) -> list[str]:
     """Return the settings of a stored stream that training windows cannot have."""
     unlike = [name for name in stream.info.settings if name not in (*HONOURED, *STATED)]
     stated = replace(stream.info.sensing, bits=stream.info.bits)
-    planes = stream.sensor.levels - 1 if stated.group else stated.planes
+    planes = stream.sensor.levels - 1 if stated.group else stated.frames
     if stream.timing != stated.timing(planes, stated.group):
         unlike.append(f"codes of {stream.info.planes_per_code} clip frames that its settings do not state")
     return unlike

@@ -98,6 +98,7 @@ SITUATIONS = (
     Situation("sense clip --name n --ppp 3 --bits 3"),
     Situation("sense clip --sensor spad-320x240 --bits 2 --ppp 3"),
     Situation("sense clip --sensor counter.toml --ppp 3"),
+    Situation("sense clip --sensor spad-320x240 --ppp 3"),
     Situation("sense clip --sensor my.toml --lux 1"),
     Situation("sense clip --sensor warm.toml --ppp 0.5", only=("temperature",)),
     Situation("sense clip --ppp 3 --row-delay 1e-6"),

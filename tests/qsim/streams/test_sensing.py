@@ -187,3 +187,27 @@ def test_numbers_of_numpy_are_those_of_python(tmp_path: Path, sensor: str, setti
         return path.name, path.read_bytes(), path.with_suffix(".json").read_bytes()
 
     assert written(settings) == written({name: value.item() for name, value in settings.items()})
+
+
+@pytest.mark.parametrize("planes", [1, 2, 5, 7, 10])
+def test_codes_of_any_number_of_planes_are_sums_of_single_planes(tmp_path: Path, planes: int):
+    """Each clip frame is a plane of its own, and a code of n planes is drawn with their random numbers."""
+    clip = write_clip(tmp_path / "c", frames=21, height=6, width=9)
+    file = tmp_path / "spad.toml"
+    file.write_text('[sensor]\nmodel = "BinarySPAD"\nbits = 1\npde = 0.5\ndark_count_rate = 100.0\n')
+    single = clip.sense(file, ppp=0.8, name="single")
+    summed = clip.sense(file, ppp=0.8 * planes, planes=planes, name="summed")
+    assert summed.sensor.levels == planes + 1
+    assert len(summed) == 21 // planes
+    assert clip.sense(file, ppp=0.8 * planes, planes=planes, name="summed").info == summed.info
+    expected = single[: 21 // planes * planes].reshape(-1, planes, 6, 9).sum(axis=1)
+    np.testing.assert_array_equal(summed[:], expected)
+
+
+def test_planes_state_the_bits_of_their_sum(tmp_path: Path):
+    with pytest.raises(ValueError, match="planes=10: their sum has 4 bits, not 3"):
+        Sensing("spad-320x240", bits=3, planes=10)
+    with pytest.raises(ValueError, match="give one of them"):
+        Sensing("spad-320x240", planes=10, slices=2)
+    with pytest.raises(ValueError, match="planes= is for a clocked SPAD"):
+        write_clip(tmp_path / "c", frames=21, height=6, width=9).sense("quiver-physical", ppp=3, planes=10)

@@ -88,7 +88,7 @@ def test_a_truth_that_is_late_is_stated(tmp_path, how, stated):
     """Two slices have no middle frame; rows at their own time take the frame nearest to each."""
     clip = write_clip(tmp_path / "c", frames=9, height=7, width=9)
     stream, line = sense(clip, Sensing(BITS3, ppp=3.0, name="s", **how))
-    assert ("; its truth is half a clip frame late, which an odd number of slices avoids" in line) == stated
+    assert ("; its truth is half a clip frame late, which an odd number of clip frames avoids" in line) == stated
     assert len(stream) >= 3
 
 

@@ -35,7 +35,7 @@ OTHER = {  # of every setting whose outcome is not in the description: a value t
 
 
 def test_every_setting_is_stored_compared_and_read_again(tmp_path):
-    elsewhere = {"sensor", "bits", "name", "defects", "colour"}
+    elsewhere = {"sensor", "bits", "planes", "name", "defects", "colour"}
     assert set(OTHER) == {setting.name for setting in settings_of(Sensing)} - elsewhere
     for name, value in OTHER.items():
         more = {"row_delay": 1e-6} if name == "row_order" else {}

@@ -109,7 +109,7 @@ def test_settings_act_in_windows_as_in_sensing(make_clip: ClipMaker, tmp_path, s
 
 def test_every_other_setting_is_refused(make_clip: ClipMaker):
     """A setting that is new is refused until windows honour it."""
-    others = {"seed": 3, "name": "x", "colour": "rggb", "follow": True}
+    others = {"seed": 3, "planes": 7, "name": "x", "colour": "rggb", "follow": True}
     assert {setting.name for setting in settings_of(Sensing)} == {*others, *HONOURED}
     clip = make_clip()
     for name, value in others.items():
