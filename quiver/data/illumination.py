@@ -167,10 +167,15 @@ class Illumination:
                 f"a sum of {planes} planes has {depth} bits, and {fixed} are asked for; give planes= or bits= alone",
             )
         made = self.but(group=True, slices=1, bits=depth)
-        if planes == 2**depth - 1 and self.record is None:
+        if planes == 2**depth - 1 and self.record is None and not self._states_bits:
             return made
-        made = made.stated()
-        return replace(made, record=as_text(made.device(5e-4).of_planes(planes).to_dict()))
+        plane = self.stated().device(5e-4)
+        return replace(made, record=as_text(plane.of_planes(planes).to_dict()), defects=self.stated().defects)
+
+    @property
+    def _states_bits(self) -> bool:
+        """Whether the sensor is a file that states the bits of its codes."""
+        return self.record is None and "bits" in devices.table_of(self.sensor)
 
     @property
     def _leaves_bits_to_sums(self) -> bool:
@@ -352,9 +357,9 @@ def file_digests(lights: Iterable[Illumination]) -> dict[str, str]:
     A light with a record states its sensor itself.
     """
     found: dict[str, str] = {}
-    for path in dict.fromkeys(light.sensor for light in lights if light.record is None):
+    for path, bits in {light.sensor: light.bits for light in lights if light.record is None}.items():
         if path.endswith(".toml"):
-            sensor, defects = read_sensor(path)
+            sensor, defects = read_sensor(path, bits)
             colour = colour_filter.from_toml(path)
             tables = (sensor.to_dict(), defects and defects.to_dict(), colour and colour.to_dict())
             found[path] = sha256(to_json(tables))

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import records
+from qsim import records, scratch
 from qsim.files import Blocked, read_json, write_json
 from quiver import threads
 from quiver.data.clips import Clip, open_clips, peak_of
@@ -322,6 +322,7 @@ def check_folder(out: Path, comparison: Comparison, *, force: bool = False) -> N
 def begin(comparison: Comparison, out: Path, clips: Sequence[Clip]) -> list[ComparisonRow]:
     """Create the folder of an evaluation, or return the finished rows of an interrupted one of the same content."""
     path = out / "plan.json"
+    scratch.sweep(out / "crops")
     content = content_of(comparison, clips)
     wanted = {"format": PLAN_FORMAT} | comparison.to_dict() | content
     if not path.exists():
