@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy import ndarray as Array
@@ -233,19 +233,24 @@ def _fill_file(
         descriptions.write(journal, Unfinished(**vars(wanted)))
         part.unlink(missing_ok=True)
         _reserve(part, codes.video_shape)
-    out = np.lib.format.open_memmap(part, mode="r+")
-    for first in range(done, length, BLOCK_FRAMES if method.seamless else length):
-        block = out[first : first + BLOCK_FRAMES if method.seamless else length]
-        block[:] = 0  # an interrupted block may be partly written
-        started = time.perf_counter()
-        method.into(codes, block, first, _shifted(progress, first, length, len(block)))
-        check_finite(block, method.name, first)
-        out.flush()
-        seconds += time.perf_counter() - started
-        reached = Unfinished(
-            **vars(wanted), done=first + len(block), seconds=seconds, threads=threads, device=method.device
-        )
-        descriptions.write(journal, reached)
+    out: Any = np.lib.format.open_memmap(part, mode="r+")
+    block: Any = None
+    try:
+        for first in range(done, length, BLOCK_FRAMES if method.seamless else length):
+            block = out[first : first + BLOCK_FRAMES if method.seamless else length]
+            block[:] = 0  # an interrupted block may be partly written
+            started = time.perf_counter()
+            method.into(codes, block, first, _shifted(progress, first, length, len(block)))
+            check_finite(block, method.name, first)
+            out.flush()
+            seconds += time.perf_counter() - started
+            reached = Unfinished(
+                **vars(wanted), done=first + len(block), seconds=seconds, threads=threads, device=method.device
+            )
+            descriptions.write(journal, reached)
+    finally:  # the traceback of an error keeps this frame, and a map the disk space of a deleted file
+        out = None
+        block = None
     with open(part, "rb") as file:
         os.fsync(file.fileno())
     return seconds
