@@ -40,8 +40,9 @@ def _named(asked: Sense, wanted: Sequence[Sensing]) -> str:
     return f"changes nothing in a replay of --name {wanted[0].name}" if asked.replay and wanted[0].name else ""
 
 
-NAMED = ("sensor", "bits", "ppp", "lux", "colour", "seed")  # the settings that make the name of a stream
+NAMED = ("sensor", "bits", "planes", "ppp", "lux", "colour", "seed")  # the settings that make the name of a stream
 IDLE = (
+    Idle(lambda asked, wanted: "is what --planes does" if wanted[0].planes else "", ("group",)),
     Idle(_several, ("name", "replay")),
     Idle(
         _replayed,

@@ -265,6 +265,8 @@ def _sensings_of(section: StreamsSection, seed: int, beside: Path) -> list[Sensi
     if len(units) != 1:
         wanted = "give one light level, ppp = ..., lux = ... or absolute = true"
         raise ValueError(f"{wanted}; {' and '.join(units) or 'none'} given")
+    if section.group is not None and section.planes is not None:
+        raise ValueError("group sums 2^bits - 1 planes, and planes says how many; give one of them")
     levels: list[dict[str, Any]] = [{}]
     if units[0] != "absolute":
         levels = [{units[0]: level} for level in _several(getattr(section, units[0]), units[0])]

@@ -138,6 +138,7 @@ MISTAKES = [
     ("ppp = [0.5, 3.25]", "absolute = false", r"streams\[0\].absolute: expected one of true, got False"),
     ("ppp = [0.5, 3.25]", 'ppp = [1, 2]\nname = "x"', r"streams\[0\]: name: one name for 4 streams"),
     ("ppp = [0.5, 3.25]", "ppp = 1e9", r"streams\[0\].ppp: expected .* 1e.06, or a list of them, got 10"),
+    ("ppp = [0.5, 3.25]", "ppp = 1\ngroup = true\nplanes = 10", "group sums .* planes, and planes says how many"),
     ("seeds = [0, 2]", "height = 90000\nwidth = 90000", r"scenes\[0\]: frames of 90000 x 90000 pixels; at most"),
     (
         "ppp = [0.5, 3.25]",
