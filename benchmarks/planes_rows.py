@@ -176,7 +176,8 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     ratios = []
     alone = []
     for name, row in rows.items():
-        sharp, summed = row["sharp"], row["summed"]
+        sharp = row["sharp"]
+        summed = row["summed"]
         alone.append(summed["light_seconds"] / sharp["processor_seconds"])
         ratios.append(summed["processor_seconds"] / sharp["processor_seconds"])
         lines.append(

@@ -218,7 +218,9 @@ def to_stream(
     sensor, tables = _tables(capture, _sensor(recording, capture, taken.planes), height, width)
     model = recording.code_model if sensor.sums_planes else sensor.code_model
     times = recording.times if taken.codes == length else _times(recording, capture, taken)
-    planes = taken.planes if taken.planes > 1 else (sensor.levels - 1 if model == "binary_sum" else 1)
+    planes = taken.planes
+    if planes == 1 and model == "binary_sum":
+        planes = sensor.levels - 1
     frames = taken.codes
     if sums.any:
         recording = replace(recording, shape=(frames, height, width), read=taken.of(recording.read))

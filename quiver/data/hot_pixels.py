@@ -178,7 +178,10 @@ class _Seen:
 
     def _apart_together(self, candidates: Array) -> bool:
         """Return whether some pixels, taken together, surely follow less than TOGETHER of what changes around them."""
-        shared, around, noise = self.followed[:, candidates].sum(axis=1)
+        sums = self.followed[:, candidates].sum(axis=1)
+        shared = sums[0]
+        around = sums[1]
+        noise = sums[2]
         changes = around - noise
         if changes < SURE * noise * np.sqrt(2 / (int(candidates.sum()) * (TIMES - 1))):
             return False

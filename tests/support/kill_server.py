@@ -105,7 +105,7 @@ def _work(main: Any, words: list[str], folder: str, step: int | None, told: Path
     def watch(event: str, arguments: tuple[Any, ...]) -> None:
         nonlocal seen
         changes = event in CHANGES or (event == "open" and bool(arguments[2] & WRITING))
-        if not changes or str(arguments[0]).startswith(("/dev", "/proc", "/tmp/matplotlib")):
+        if not changes or not os.path.abspath(str(arguments[0])).startswith(folder):  # caches of libraries
             return
         seen += 1
         if seen == step:

@@ -22,7 +22,9 @@ class Spinning:
     square: bool = False
 
     def grid(self) -> tuple[Array, Array]:
-        y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+        places = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+        y = places[0]
+        x = places[1]
         return y - 19.5, x - 24.5
 
     def body_id(self, t: int) -> Array:
@@ -44,7 +46,7 @@ class Spinning:
 
     def valid(self, t: int) -> Array:
         u, _v = self.flow(t)
-        _y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+        x = np.mgrid[: SHAPE[0], : SHAPE[1]][1]
         hidden = self.square & (np.rint(x + u) < 20) & (self.body_id(t) == 1)
         return ~hidden
 

@@ -60,7 +60,8 @@ def test_planes_and_their_mean_have_the_errors_that_they_state(monkeypatch, deno
                 row[-1].append(more if denoise else 0.0)
             ratios.append(row)
     found = np.reshape(ratios, (DRAWS, 2, 2, 2))  # draws, white, plane or mean, ratio and what is added
-    ratio, more = found[:, 0, :, 0], found[:, 0, :, 1]
+    ratio = found[:, 0, :, 0]
+    more = found[:, 0, :, 1]
     sigma = ratio.std(axis=0, ddof=1) / math.sqrt(DRAWS)
     assert (np.abs(ratio.mean(axis=0) - 1) < critical_z(checks=4) * sigma + more.mean(axis=0)).all()
     # Clamped errors are upper estimates where a half is above white
