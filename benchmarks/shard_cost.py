@@ -43,13 +43,14 @@ def variants(wanted: Recipe) -> dict[str, Recipe]:
 
 
 def with_reuse(wanted: Recipe, reuse: bool | None) -> Recipe:
-    jobs = (replace(job, settings=replace(job.settings, reuse=reuse)) for job in wanted.jobs)
-    return replace(wanted, jobs=tuple(jobs))
+    return replace(
+        wanted, jobs=wanted.jobs.changed(lambda job: replace(job, settings=replace(job.settings, reuse=reuse)))
+    )
 
 
 def part(wanted: Recipe, which: tuple[int, int]) -> Recipe:
     """Return the recipe of the clips of one shard."""
-    return replace(wanted, jobs=tuple(shard(wanted.jobs, which)))
+    return replace(wanted, jobs=shard(wanted.jobs, which))
 
 
 def read_plan(path: Path, wanted: dict[str, Recipe], what: str) -> dict[str, Any]:
@@ -99,8 +100,7 @@ def kind_of(wanted: Recipe) -> dict[str, int]:
 def read_shard(path: Path, wanted: dict[str, Recipe], what: str) -> dict[str, Any]:
     """Return what the clips of a shard cost and hold; `ValueError` if it is unfinished or of another recipe."""
     data = Dataset.open(path)
-    digests = {name: job.digest for name, job in data.info.jobs.items()}
-    way = next((way for way, each in wanted.items() if all(digests.get(j.name) == j.digest for j in each.jobs)), None)
+    way = next((way for way, each in wanted.items() if all(data.holds(job) for job in each.jobs)), None)
     if way is None:
         raise ValueError(f"{path}: was made from another recipe than {what}")
     names = sorted(job.name for job in wanted[way].jobs)

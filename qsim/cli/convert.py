@@ -12,6 +12,7 @@ from qsim.cli.command import Idle, command
 from qsim.cli.completion import sensors
 from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, in_options, note, output, running
 from qsim.cli.options import check_free
+from qsim.dataset.clip_list import ClipList
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
@@ -231,7 +232,7 @@ def _pairs(asked: Convert) -> tuple[Path, str]:
         data = Dataset.open(asked.source)
         splits = {split: data.clips(split) for split in SPLITS}
     else:
-        splits = {"all": [Clip.open(asked.source)]}
+        splits = {"all": ClipList.of([Clip.open(asked.source)])}
     with bar("converting", "window") as progress:
         about = pairs.write(splits, asked.output, asked.window or pairs.WINDOW, force=asked.force, progress=progress)
     return asked.output, about

@@ -17,6 +17,7 @@ from qsim.cli.command import Idle, command
 from qsim.cli.completion import recipes as recipe_names
 from qsim.cli.console import PILOT, RESUMES, bar, in_options, note, output, running
 from qsim.dataset.job import Job
+from qsim.dataset.jobs import Jobs
 from qsim.dataset.recipe import Recipe
 from qsim.kinds import Frames, NotNegative, Positive, Text, Whole
 from qsim.rendering.render_settings import RenderSettings
@@ -92,7 +93,7 @@ def generate(asked: Generate) -> int:
     lines += [f"repaired {problem}" for problem in summary.repaired]
     lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]
     lines += [f"SHARED {problem}" for problem in summary.shared]
-    lines += [*_limits(folder, chosen), *_noisy(folder, chosen)]
+    lines += _reached(folder, chosen)
     if summary.failed:
         lines.append("run again with --retry after removing the cause")
     output({"dataset": str(folder)} | dataclasses.asdict(summary), lines)
@@ -117,28 +118,26 @@ def _defaults(wanted: Recipe) -> str:
     return f"; by default {', '.join(taken)}" if taken else ""
 
 
-def _limits(folder: Path, jobs: list[Job]) -> list[str]:
-    """Return a line that states which limit, dB or PPP, decided the samples of how many finished clips."""
-    from qsim.clip.manifest import read_info
-    from qsim.rendering.budget import deciding
-
-    described = (folder / "clips" / job.name / "clip.json" for job in jobs)
-    renders = [read_info(path).render for path in described if path.is_file()]
-    found = Counter(limit for render in renders if render and (limit := deciding(render.findings)))
-    counted = ", ".join(f"{limit} in {clips} clip{'s' * (clips != 1)}" for limit, clips in sorted(found.items()))
-    return [f"the samples follow from {counted}"] if found else []
-
-
-def _noisy(folder: Path, jobs: list[Job]) -> list[str]:
-    """Return a line for each finished clip whose error exceeds that of the recipe."""
+def _reached(folder: Path, jobs: Jobs) -> list[str]:
+    """Return which limit, dB or PPP, decided the samples of how many finished clips, and which missed their error."""
     from qsim.clip.clamped_error import stated
     from qsim.clip.manifest import read_info
+    from qsim.rendering.budget import deciding
     from qsim.rendering.fidelity import shortfall
 
-    described = {job.name: folder / "clips" / job.name / "clip.json" for job in jobs}
-    found = {name: stated(read_info(path)) for name, path in described.items() if path.is_file()}
-    missed = {job.name: shortfall(found.get(job.name), job.settings.psnr) for job in jobs}
-    return [f"{name} reached {why}" for name, why in missed.items() if why]
+    limits: Counter[str] = Counter()
+    missed = []
+    for job in jobs:
+        path = folder / "clips" / job.key / "clip.json"
+        if not path.is_file():
+            continue
+        info = read_info(path)
+        if info.render and (limit := deciding(info.render.findings)):
+            limits[limit] += 1
+        if why := shortfall(stated(info), job.settings.psnr):
+            missed.append(f"{job.name} reached {why}")
+    counted = ", ".join(f"{limit} in {clips} clip{'s' * (clips != 1)}" for limit, clips in sorted(limits.items()))
+    return [*([f"the samples follow from {counted}"] if limits else []), *missed]
 
 
 def _cluster(asked: Generate) -> Any:
@@ -174,7 +173,7 @@ def plan(asked: Plan) -> int:
     from qsim.dataset import cost_forecast, generation, recipe
 
     whole = recipe.load(asked.recipe)
-    wanted = dataclasses.replace(whole, jobs=tuple(generation.shard(whole.jobs, asked.shard)))
+    wanted = dataclasses.replace(whole, jobs=generation.shard(whole.jobs, asked.shard))
     with bar("planning", "kind") as progress:
         found = cost_forecast.forecast(wanted, frames=asked.frames, progress=progress)
     facts = {"recipe": wanted.name, "digest": wanted.digest, "machines": asked.machines}
@@ -246,12 +245,13 @@ def sensors(asked: Sensors) -> int:
     return 0
 
 
-def _contents(jobs: Sequence[Job]) -> str:
+def _contents(jobs: Jobs) -> str:
     """Return the contents of a data set: `9 clips of 24 frames of 128 x 128 at 2000 fps; streams: ...`."""
+    kinds = [part[0] for part in jobs.by_section()]
     sizes = dict.fromkeys(
-        f"{s.frames} frames of {s.height} x {s.width} at {s.frame_rate:g} fps" for s in (job.settings for job in jobs)
+        f"{s.frames} frames of {s.height} x {s.width} at {s.frame_rate:g} fps" for s in (job.settings for job in kinds)
     )
-    streams = dict.fromkeys(sensing.stream_name for job in jobs for sensing in job.streams)
+    streams = dict.fromkeys(sensing.stream_name for job in kinds for sensing in job.streams)
     return f"{len(jobs)} clip{'s' * (len(jobs) != 1)} of {' or '.join(sizes)}; streams: {', '.join(streams) or 'none'}"
 
 
@@ -262,12 +262,20 @@ class Check:
     paths: Annotated[
         tuple[Path, ...], setting("data sets, clips, streams, restored video", shown="PATH", positional=True)
     ]
+    shard: Annotated[
+        tuple[int, int] | None,
+        setting("only the I-th of N parts of a data set, as in 7/100", shown="I/N", read=part_of),
+    ] = None
     redraw: Annotated[
         bool, setting("draw streams again with the reference engine and name those that differ; slow")
     ] = False
 
 
-@command("qsim check out/starter out/fan out/fan_restored.npy", "qsim check out/starter --redraw")
+@command(
+    "qsim check out/starter out/fan out/fan_restored.npy",
+    "qsim check out/starter --redraw",
+    "qsim check /data/mine --shard 7/100",
+)
 def check(asked: Check) -> int:
     """Print the problems of all files; return 1 if there are any."""
     from qsim.dataset import checking
@@ -276,10 +284,10 @@ def check(asked: Check) -> int:
     again: list[checking.Redrawn] = []
     for path in asked.paths:
         with bar(str(path), "clip" if (path / "dataset.json").is_file() else "file") as progress:
-            problems += checking.check(path, progress)
+            problems += checking.check(path, progress, asked.shard)
         if asked.redraw:
             with bar(f"{path} again", "stream") as progress:
-                again += checking.redraw(path, progress)
+                again += checking.redraw(path, progress, asked.shard)
     names = ", ".join(str(path) for path in asked.paths)
     facts: dict[str, Any] = {"paths": [str(path) for path in asked.paths], "problems": problems}
     lines = checking.lines(problems, names)

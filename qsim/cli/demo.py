@@ -7,7 +7,6 @@ are in the package (qsim/measurements/, with their licences).
 from __future__ import annotations
 
 import io
-import json
 import shlex
 import subprocess
 import sys
@@ -22,6 +21,7 @@ import numpy as np
 from qsim.cli.command import command
 from qsim.cli.console import OPTIONAL, RESUMES, failed, output, running
 from qsim.cli.options import check_free
+from qsim.dataset.dataset import Dataset
 from qsim.files import to_json, write_bytes, write_json
 from qsim.settings import setting
 from qsim.terminal import is_lost, printable
@@ -121,8 +121,7 @@ def steps(out: Path, quiet: bool) -> None:
     run("Rendering moving scenes at 2000 fps and sensing them", "qsim", "generate", "demo", "-o", data)
     how = ("--preset", NETWORK, "--start", NETWORK, "--learning-rate", RATE, "--minutes", MINUTES, *LIGHT)
     run(f"Training the shipped {NETWORK} further on these scenes", "quiver", "train", data, "-o", trained, *how)
-    jobs = json.loads((data / "dataset.json").read_text())["jobs"]
-    for name in [name for name, job in jobs.items() if job["split"] == "test"]:
+    for name in Dataset.open(data).names("test"):
         restore(data / "clips" / name, out / f"{name}_trained_here.npy", str(trained))
         restore(data / "clips" / name, out / f"{name}_shipped.npy", NETWORK)
     ball = out / "ball"

@@ -12,16 +12,17 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from qsim import files
+from qsim.checks import ArgumentError
 from qsim.clip import manifest
-from qsim.dataset.dataset import Dataset
+from qsim.dataset.dataset import Dataset, Part
 from qsim.dataset.job import Job
-from qsim.dataset.job_record import JobInfo, read_record, record_path, verify_job
+from qsim.dataset.job_record import read_record, record_path, verify_job
 from qsim.files import Progress
 from qsim.restored_video import Restored, describes_restored
 from qsim.streams.clip import Clip
@@ -37,14 +38,16 @@ def lines(problems: list[str], names: str) -> list[str]:
     return problems or [f"{names}: every file is what was written"]
 
 
-def check(path: Path, progress: Progress | None = None) -> list[str]:
+def check(path: Path, progress: Progress | None = None, shard: Part | None = None) -> list[str]:
     """Compare every file below a data set, a clip, a stream or a restored video with its checksum; return problems.
 
-    `FileNotFoundError` or `ValueError` if the path is none of them. `progress` is called with (done, total).
+    `shard` (i, n) takes the i-th of n parts of a data set. `FileNotFoundError` or `ValueError` if the path is none of
+    them. `progress` is called with (done, total).
     """
     if (path / "dataset.json").is_file() or (path / "jobs").is_dir():
         dataset = Dataset.open(path)
-        return dataset.verify(progress)
+        return dataset.verify(progress, shard)
+    _refuse_shard(path, shard)
     if (path / "clip.json").is_file() or not path.with_suffix(".json").is_file():
         return _checked(lambda: Clip.open(path), path / "clip.json", progress)
     description = path.with_suffix(".json")
@@ -54,6 +57,12 @@ def check(path: Path, progress: Progress | None = None) -> list[str]:
     if describes_restored(found):
         return _checked(lambda: Restored.open(description), description, progress)
     raise ValueError(f"{path}: expected a data set, a clip, a stream or a restored video")
+
+
+def _refuse_shard(path: Path, shard: Part | None) -> None:
+    """Raise `ValueError` for a part of something that is no data set."""
+    if shard is not None:
+        raise ArgumentError("shard", f"is a part of a data set, and {path} is none; leave it out")
 
 
 def _checked(open_it: Callable[[], Any], description: Path, progress: Progress | None) -> list[str]:
@@ -96,14 +105,14 @@ class Redrawn:
         return f"{found}, first in frame {self.first}; {self.cure}"
 
 
-def redraw(path: Path, progress: Progress | None = None) -> list[Redrawn]:
+def redraw(path: Path, progress: Progress | None = None, shard: Part | None = None) -> list[Redrawn]:
     """Draw one stream again, or every stream of a clip or a data set; `check` names the damaged ones.
 
-    `progress(done, total)` is called after each stream. `FileNotFoundError` or `ValueError` if there is none. Restored
-    video has none, and its result is empty.
+    `shard` (i, n) takes the i-th of n parts of a data set. `progress(done, total)` is called after each stream.
+    `FileNotFoundError` or `ValueError` if there is none. Restored video has none, and its result is empty.
     """
-    found = _streams(path)
-    if not found and path.is_dir():
+    found = list(_streams(path, shard))
+    if not found and path.is_dir() and shard is None:
         raise ValueError(f"{path}: holds no stream to draw again")
     results = []
     for done, (clip, json_path, again) in enumerate(found, 1):
@@ -142,11 +151,12 @@ def _cure(dataset: Path | None) -> str:
     return f"delete the file, and `qsim generate` of {dataset} makes it again with repair=True"
 
 
-def _streams(path: Path) -> list[tuple[Path, Path, Path | None]]:
+def _streams(path: Path, shard: Part | None) -> list[tuple[Path, Path, Path | None]]:
     """Return clip, description and, where its recipe made it, data set of every stream below a path."""
     if (path / "dataset.json").is_file():
-        names = Dataset.open(path).names()
-        return [each for name in names for each in _of_clip(path / "clips" / name, record_path(path, name), path)]
+        keys = Dataset.open(path).keys(shard)
+        return [each for key in keys for each in _of_clip(path / "clips" / key, record_path(path, key), path)]
+    _refuse_shard(path, shard)
     if (path / "clip.json").is_file() or not path.with_suffix(".json").is_file():
         if not (path / "clip.json").is_file():
             Clip.open(path)  # raises the error that names what is missing
@@ -186,18 +196,17 @@ def redrawn_lines(found: list[Redrawn]) -> list[str]:
     return [*found_lines, f"drawn again: {len(drawn)} of {len(found)} streams, {total} codes; {verdict}"]
 
 
-def repair_jobs(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
+def repair_jobs(folder: Path, jobs: Sequence[Job]) -> tuple[str, ...]:
     """Check the finished jobs, remove what is damaged, and return the problems.
 
     The next run draws a damaged stream again and writes a damaged record again; every other damage costs a rendering.
     Streams that `qsim sense` added to a removed clip are lost, and each is named.
     `FileExistsError` for a clip to remove that holds other files than ours.
     """
-    entries = Dataset.open(folder).info.jobs
-    checked = [_damage(folder, job, entries[job.name]) for job in jobs if record_path(folder, job.name).is_file()]
+    checked = (_damage(folder, job) for job in jobs if record_path(folder, job.key).is_file())
     taken = [damage for damage in checked if damage.problems]
     for damage in taken:  # refused before anything is deleted
-        clip = folder / "clips" / damage.job.name
+        clip = folder / "clips" / damage.job.key
         if clip.is_symlink() and not damage.light:
             raise ValueError(
                 f"{damage.problems[0]}; {clip} is a symbolic link to {os.readlink(clip)}, and repair=True replaces no "
@@ -218,12 +227,11 @@ class _Damage:
     light: bool  # repaired without rendering: only streams, or only the record
 
 
-def _damage(folder: Path, job: Job, entry: JobInfo) -> _Damage:
-    """Check the files of a finished job; `entry` is its entry in the manifest."""
-    expected = dataclasses.replace(entry, digest=job.digest, split=job.split)
-    problems = verify_job(folder, job.name, expected)
-    record = record_path(folder, job.name)
-    clip = folder / "clips" / job.name
+def _damage(folder: Path, job: Job) -> _Damage:
+    """Check the files of a finished job."""
+    problems = verify_job(folder, job.key, job.digest, job.split)
+    record = record_path(folder, job.key)
+    clip = folder / "clips" / job.key
     damaged = {Path(problem.split(": ")[0]) for problem in problems}
     if record in damaged:
         light = damaged == {record}
@@ -234,8 +242,8 @@ def _damage(folder: Path, job: Job, entry: JobInfo) -> _Damage:
 
 def _take_back(folder: Path, damage: _Damage) -> list[str]:
     """Delete the record and what is damaged; return the problems and the added streams that are lost."""
-    record = record_path(folder, damage.job.name)
-    clip = folder / "clips" / damage.job.name
+    record = record_path(folder, damage.job.key)
+    clip = folder / "clips" / damage.job.key
     streams = clip / "streams"
     wanted = {sensing.stream_name for sensing in damage.job.streams}
     record.unlink()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -20,6 +21,7 @@ from typing import Any, NamedTuple
 from qsim.backend import on_gpu
 from qsim.dataset import job_runner
 from qsim.dataset.job import Job
+from qsim.dataset.jobs import Jobs
 from qsim.dataset.recipe import Recipe
 from qsim.dataset.worker_pool import Limits
 from qsim.files import Progress
@@ -210,15 +212,17 @@ def forecast(recipe: Recipe, *, frames: int = 5, progress: Progress | None = Non
     return Forecast(tuple(costs), f"{chosen.backend}, {chosen.variant}", peak_memory() / 2**30)
 
 
-def kinds_of(recipe: Recipe) -> list[list[Job]]:
+def kinds_of(recipe: Recipe) -> list[Jobs]:
     """Return the jobs by kind, in the order in which a forecast lists the kinds."""
-    kinds: dict[tuple[Any, ...], list[Job]] = {}
-    for job in recipe.jobs:
-        kinds.setdefault((job.family, job.settings, job.streams), []).append(job)
+    kinds: dict[tuple[Any, ...], Jobs] = {}
+    for part in recipe.jobs.by_section():
+        job = part[0]
+        kind = (job.family, job.settings, job.streams)
+        kinds[kind] = kinds[kind].together(part) if kind in kinds else part
     return list(kinds.values())
 
 
-def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
+def measure_kind(members: Sequence[Job], folder: Path, frames: int) -> Cost:
     """Measure the cost of a kind from some of its jobs, each met for the first time as in a run.
 
     Each scene has its own kernels, which its pilot compiles.
@@ -279,7 +283,7 @@ def setup_and_frame(moments: list[Seconds], shared: int, planes: int = 1) -> tup
     return Seconds(*(max(0.0, a - len(moments) * b) for a, b in zip(moments[-1], frame, strict=True))), frame
 
 
-def evenly_spaced(members: list[Job]) -> list[Job]:
+def evenly_spaced(members: Sequence[Job]) -> list[Job]:
     """Return at most LOOKED_AT jobs, evenly spaced from the first to the last."""
     count = min(LOOKED_AT, len(members))
     return [members[round(i * (len(members) - 1) / max(1, count - 1))] for i in range(count)]

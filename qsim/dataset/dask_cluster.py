@@ -21,8 +21,9 @@ LIMITS where it is started: `--memory-limit 4GiB --lifetime 1h --lifetime-stagge
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from qsim import files
 from qsim.dataset.job import Job
 from qsim.dataset.job_runner import RenderJob, Result, mark_failed, run_job
 
+IN_FLIGHT = 5000  # jobs at the scheduler, which holds some kB for each
 RETRIES = 3  # of a job that raised; the scheduler counts the workers that crashed (its allowed-failures)
 
 
@@ -42,7 +44,7 @@ class Cluster:
     def __init__(self, address: str, *, gpus: float = 0, timeout: float = 10.0) -> None:
         self.address, self.gpus, self.timeout = address, gpus, timeout
 
-    def __call__(self, jobs: list[Job], folder: Path, make: RenderJob) -> Generator[Result]:
+    def __call__(self, jobs: Iterable[Job], folder: Path, make: RenderJob) -> Generator[Result]:
         distributed = _distributed()
         resources = {"GPU": self.gpus} if self.gpus > 0 else None
         try:
@@ -50,23 +52,33 @@ class Cluster:
         except (OSError, TimeoutError, ValueError) as error:
             raise ValueError(f"{self.address}: no Dask scheduler answers there ({_short(error)})") from None
         with client:
-            # One future per job. pure=False: the result of a job is its files, not the value that is returned.
-            futures = {
-                client.submit(
-                    run_job,
-                    job,
-                    folder,
-                    make,
-                    key=task_key(folder, job),
-                    pure=False,
-                    retries=RETRIES,
-                    resources=resources,
-                ): job
-                for job in jobs
-            }
+            waiting = iter(jobs)
+            futures = {}
+
+            def submit(count: int) -> list[Any]:
+                """Submit the next jobs; pure=False: the result of a job is its files, not the value returned."""
+                given = {
+                    client.submit(
+                        run_job,
+                        job,
+                        folder,
+                        make,
+                        key=task_key(folder, job),
+                        pure=False,
+                        retries=RETRIES,
+                        resources=resources,
+                    ): job
+                    for job in itertools.islice(waiting, count)
+                }
+                futures.update(given)
+                return list(given)
+
             try:
-                for future in distributed.as_completed(list(futures)):
-                    yield _result(future, futures[future], folder)
+                running = distributed.as_completed(submit(IN_FLIGHT))
+                for future in running:
+                    job = futures.pop(future)
+                    running.update(submit(1))
+                    yield _result(future, job, folder)
                     future.release()
             finally:
                 client.cancel(list(futures))

@@ -1,25 +1,38 @@
 """Reads and checks a data set: a folder of clips that generation.py makes from one recipe.
 
-dataset.json   recipe, splits by scene, state of every job, its own checksum; rewritten when a generation ends
-clips/NAME     clip folders with their streams           (streams/clip.py)
-jobs/NAME.json records; a clip counts as finished when its record exists (job_record.py)
+dataset.json   recipe, series of clips with their digests, its own checksum; written when a generation begins
+clips/KEY      clip folders with their streams           (streams/clip.py)
+jobs/KEY.json  records; a clip counts as finished when its record exists (job_record.py)
+
+KEY is a clip's name, with the folder of its block where there are more than a thousand clips (series.py). What is
+finished is found by listing the folders of the records, a thousand at a time.
 """
 
 from __future__ import annotations
 
+import functools
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from numpy import ndarray as Array
+
 from qsim import descriptions, files
 from qsim.checks import SPLITS, file_path
-from qsim.dataset.job_record import JobInfo, record_path, verify_job
+from qsim.dataset.clip_list import ClipList, ClipsOfDataset
+from qsim.dataset.job import Job
+from qsim.dataset.job_record import failure, failure_notes, record_path, verify_job
 from qsim.dataset.recipe_file import RecipeFile
+from qsim.dataset.series import Listing, Series
 from qsim.files import Progress
 from qsim.host import own_numbers
 from qsim.kinds import Name
 from qsim.rendering.render_settings import RenderSettings
 from qsim.streams.clip import Clip
+
+Part = tuple[int, int]  # (i, n): the i-th of n parts, i = 1 ... n
+NAMED = 1000  # unfinished clips that a check names one by one
 
 
 class Damaged(ValueError):
@@ -32,13 +45,8 @@ class DatasetInfo:
 
     name: Name
     recipe: RecipeFile | None = None  # as it was written
-    jobs: dict[Name, JobInfo]
+    scenes: tuple[Series, ...] = ()
     software: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def complete(self) -> bool:
-        """Whether all clips are finished."""
-        return all(job.state == "done" for job in self.jobs.values())
 
 
 @own_numbers
@@ -71,8 +79,11 @@ class Dataset:
             raise Damaged(str(error)) from None
 
     def __repr__(self) -> str:
-        splits = ", ".join(f"{len(self.names(split))} {split}" for split in SPLITS)
-        missing = f", {len(self.missing)} not made yet" if self.missing else ""
+        done = self.finished()
+        counts = {split: sum(int(done[part.start : part.stop].sum()) for part in self.parts(split)) for split in SPLITS}
+        splits = ", ".join(f"{count} {split}" for split, count in counts.items())
+        left = len(done) - int(done.sum())
+        missing = f", {left} not made yet" if left else ""
         head = None if self.recipe is None else self.recipe.recipe
         if head is None:
             return f"<Dataset {self.name}: clips {splits}{missing}>"
@@ -90,49 +101,132 @@ class Dataset:
         """Return the recipe as it was written."""
         return self.info.recipe
 
-    def names(self, split: str | None = None) -> list[str]:
-        """Return the names of the finished clips of one split, or of all. `ValueError` for an unknown split."""
+    @functools.cached_property
+    def listing(self) -> Listing:
+        """The clips of the recipe by their indices, finished or not."""
+        return Listing(self.info.scenes)
+
+    def parts(self, split: str | None = None) -> list[range]:
+        """Return the indices of each series of one split, or of all. `ValueError` for an unknown split."""
         if split is not None and split not in SPLITS:
             raise ValueError(f"{self.path}: unknown split {split!r}; there are {', '.join(SPLITS)}")
-        chosen = [name for name, job in self.info.jobs.items() if split in (None, job.split)]
-        return [name for name in chosen if record_path(self.path, name).is_file()]
+        return [part for one, part in self.listing.splits if split in (None, one)]
 
-    def clips(self, split: str | None = None) -> list[Clip]:
-        """Return the finished clips of one split, or of all."""
-        return [Clip.open(self.path / "clips" / name) for name in self.names(split)]
+    def finished(self) -> Array:
+        """Return whether each clip has a record, bool [clips]; lists the folders of the records."""
+        found = np.zeros(len(self.listing), bool)
+        for block, indices in self.listing.blocks():
+            try:
+                there = set(os.listdir(self.path / "jobs" / block))
+            except FileNotFoundError:
+                continue
+            if there:
+                names = self.listing.names(indices.start, indices.stop)
+                found[indices.start : indices.stop] = [f"{name}.json" in there for name in names]
+        return found
+
+    def indices(self, split: str | None = None) -> Array:
+        """Return the indices of the finished clips of one split, or of all, int64."""
+        parts = self.parts(split)
+        done = self.finished()
+        wanted = np.zeros_like(done)
+        for part in parts:
+            wanted[part.start : part.stop] = True
+        return np.flatnonzero(done & wanted)
+
+    def names(self, split: str | None = None) -> list[str]:
+        """Return the names of the finished clips of one split, or of all. `ValueError` for an unknown split."""
+        return [self.listing.name(index) for index in self.indices(split).tolist()]
+
+    def keys(self, shard: Part | None = None) -> list[str]:
+        """Return the names of the finished clips with the folders of their blocks, of all or the i-th of n parts."""
+        return [self.listing.key(index) for index in shard_of(self.indices(), shard).tolist()]
+
+    def holds(self, job: Job) -> bool:
+        """Return whether the recipe of the data set has this job, with these settings."""
+        index = self.listing.find(job.name)
+        return index is not None and self.listing.digest(index) == job.digest
+
+    def folder(self, index: int) -> Path:
+        """Return the folder of a clip."""
+        return self.path / "clips" / self.listing.key(index)
+
+    def clips(self, split: str | None = None) -> ClipList:
+        """Return the finished clips of one split, or of all; each is opened when it is asked for."""
+        return ClipList((ClipsOfDataset(self, self.indices(split)),))
 
     @property
     def missing(self) -> list[str]:
         """Return the names of the recipe's unfinished clips."""
-        return [name for name in self.info.jobs if not record_path(self.path, name).is_file()]
+        return [self.listing.name(index) for index in np.flatnonzero(~self.finished()).tolist()]
 
-    def verify(self, progress: Progress | None = None) -> list[str]:
+    def failed(self) -> dict[str, str]:
+        """Return why clips that are not finished failed, by their names; an unreadable note counts."""
+        found = {}
+        for key, path in failure_notes(self.path):
+            index = self.listing.find(path.stem)
+            if index is None or self.listing.key(index) != key or record_path(self.path, key).is_file():
+                continue
+            if (reason := failure(path, self.listing.digest(index))) is not None:
+                found[path.stem] = reason
+        return found
+
+    def verify(self, progress: Progress | None = None, shard: Part | None = None) -> list[str]:
         """Return the problems of all files, one per file; clips not made yet are problems too.
 
-        `progress(done, total)` is called after each clip.
+        `shard` (i, n) takes the i-th of n parts of the clips. `progress(done, total)` is called after each clip.
         """
-        problems = [f"{self.path / 'clips' / name}: not made yet; run `qsim generate` again" for name in self.missing]
-        names = self.names()
-        for done, name in enumerate(names, 1):
-            problems += verify_job(self.path, name, self.info.jobs[name])
+        done = self.finished()
+        chosen = shard_of(np.arange(len(done)), shard)
+        missing = chosen[~done[chosen]]
+        problems = [
+            f"{self.folder(index)}: not made yet; run `qsim generate` again" for index in missing[:NAMED].tolist()
+        ]
+        if len(missing) > NAMED:
+            problems.append(f"{self.path}: {len(missing) - NAMED} more clips are not made yet")
+        made = chosen[done[chosen]]
+        for number, index in enumerate(made.tolist(), 1):
+            series, _, _ = self.listing.scene(index)
+            problems += verify_job(self.path, self.listing.key(index), self.listing.digest(index), series.split)
             if progress is not None:
-                progress(done, len(names))
-        return problems + self.shared_between_splits()
+                progress(number, len(made))
+        return problems + self.shared_between_splits(shard)
 
-    def shared_between_splits(self) -> list[str]:
+    def shared_between_splits(self, shard: Part | None = None) -> list[str]:
         """Return one line per scene, mesh, texture and file of the test split that another split holds too.
 
         They are compared by content: a mesh by its vertices, a texture by its pixels or its file, a file by its bytes.
+        `shard` (i, n) compares the i-th of n parts of the other splits with the whole test split.
         """
+        tested = {index: _seen_in(self.folder(index)) for index in self.indices("test").tolist()}
+        sought = set().union(*tested.values())
         elsewhere: dict[str, str] = {}
-        for name in self.names("train") + self.names("val"):
-            elsewhere |= dict.fromkeys(_seen_in(self.path / "clips" / name), name)
+        for split in ("train", "val") if sought else ():
+            for index in shard_of(self.indices(split), shard).tolist():
+                name = self.listing.name(index)
+                elsewhere |= {key: name for key in _seen_in(self.folder(index)) if key in sought}
         return [
-            f"{self.path / 'clips' / name}: its {asset} is also in {elsewhere[key]}, which is not a test clip"
-            for name in self.names("test")
-            for key, asset in _seen_in(self.path / "clips" / name).items()
+            f"{self.folder(index)}: its {asset} is also in {elsewhere[key]}, which is not a test clip"
+            for index, seen in tested.items()
+            for key, asset in seen.items()
             if key in elsewhere
         ]
+
+
+def shard_of(indices: Array, shard: Part | None) -> Array:
+    """Return every n-th index from the i-th on, of a part (i, n); all without one."""
+    if shard is None:
+        return indices
+    part, parts = checked_part(shard)
+    return indices[part - 1 :: parts]
+
+
+def checked_part(shard: Part) -> Part:
+    """Return a part (i, n); `ValueError` unless 1 <= i <= n."""
+    part, parts = shard
+    if not 1 <= part <= parts:
+        raise ValueError(f"shard {part}/{parts}: expected i/n with 1 <= i <= n, as in 7/100")
+    return shard
 
 
 def _seen_in(path: Path) -> dict[str, str]:

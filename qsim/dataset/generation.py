@@ -10,26 +10,28 @@ import contextlib
 import errno
 import os
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from qsim import descriptions, files, scratch
 from qsim.clip.manifest import read_info
 from qsim.dataset.checking import repair_jobs
-from qsim.dataset.dataset import Damaged, Dataset, DatasetInfo
+from qsim.dataset.dataset import Damaged, Dataset, DatasetInfo, Part, checked_part
 from qsim.dataset.job import Job
-from qsim.dataset.job_record import Failure, JobInfo, failure_path, read_record, record_path, unproven
+from qsim.dataset.job_record import failure, failure_notes, failure_path, read_record, record_path, unproven
 from qsim.dataset.job_runner import FOLDERS, RenderJob, Result, mark_failed, render_job
+from qsim.dataset.jobs import Jobs
 from qsim.dataset.recipe import Recipe
 from qsim.dataset.worker_pool import Limits, run_here, run_local
 from qsim.files import VERSION, Progress
 from qsim.locks import Lock
 from qsim.scratch import sweep
 
-Executor = Callable[[list[Job], Path, RenderJob], Generator[Result]]
+Executor = Callable[[Iterable[Job], Path, RenderJob], Generator[Result]]
 
 
+READ = 1000  # clips of a section whose files of the user are compared before the first clip is made
 _REPORTED = "a worker reports that it is done, but "
 _ELSEWHERE = f"{_REPORTED}its record is missing; does every worker have this folder at this path?"
 
@@ -39,7 +41,7 @@ class Options:
     """Options of a generation; none changes a byte of the result."""
 
     workers: int = 1  # processes; 0: run the jobs in this process
-    shard: tuple[int, int] | None = None  # (i, n): the i-th of n shards, i = 1 ... n
+    shard: Part | None = None  # (i, n): the i-th of n shards, i = 1 ... n
     retry: bool = False  # try failed jobs again
     repair: bool = False  # check all files first and make damaged ones again
     wait: bool = False  # wait for another generator on the folder instead of refusing
@@ -55,7 +57,7 @@ class Summary:
     made: int  # finished now
     failed: dict[str, str]  # name -> reason, now or before
     repaired: tuple[str, ...]  # problems that led to jobs done again
-    shared: tuple[str, ...] = ()  # assets of the test split that other splits hold too
+    shared: tuple[str, ...] = ()  # assets of the test split that other splits hold too; not looked for by a shard
 
 
 def generate(
@@ -77,140 +79,227 @@ def generate(
     jobs = shard(recipe.jobs, options.shard)
     try:
         with _locked(folder, options):
-            repaired = _begin(recipe, folder, options.repair)
+            repaired = _begin(recipe, folder, jobs, options.repair)
             repaired += repair_jobs(folder, jobs) if options.repair else ()
-            failed = {} if options.retry else _failures(folder, jobs)
-            todo = [job for job in jobs if not record_path(folder, job.name).is_file() and job.name not in failed]
-            made: list[str] = []
+            todo = _Todo(folder, jobs, retry=options.retry)
             with contextlib.closing((run or _runner(options))(todo, folder, make)) as results:
                 for result in results:
                     if result.state == "full":
                         raise OSError(errno.ENOSPC, result.message)
                     if result.state == "gone":
                         raise FileNotFoundError(result.message)
-                    # A worker may crash after it has written the record.
-                    if result.state == "done" or record_path(folder, result.name).is_file():
-                        made.append(result.name)
-                    else:
-                        failed[result.name] = result.message
+                    todo.answer(result)
                     if on_result is not None:
                         on_result(result)
-            failed |= _unproven(folder, todo, made)
-            write_manifest(recipe, folder)
-            done = sum(record_path(folder, job.name).is_file() for job in jobs)
-            shared = tuple(Dataset.open(folder).shared_between_splits())
+            todo.end()
+            shared = () if options.shard else tuple(Dataset.open(folder).shared_between_splits())
     except OSError as error:
         if error.errno not in files.FULL:
             raise
         message = f"{folder}: {error.strerror}; nothing is lost: make space and run the same command again"
         raise OSError(message) from None
-    made = [name for name in made if name not in failed]
-    return Summary(len(jobs), done, len(made), failed, repaired, shared)
+    return Summary(len(jobs), todo.before + todo.made, todo.made, todo.failed, repaired, shared)
 
 
-def _unproven(folder: Path, jobs: list[Job], made: list[str]) -> dict[str, str]:
-    """Return the jobs that a worker reports as done and that are not, with the reason; delete their records."""
-    by_name = {job.name: job for job in jobs}
-    failed = {}
-    for name in made:
-        if name not in by_name:
-            failed[name] = f"{_REPORTED}no worker was given it"
-        elif not record_path(folder, name).is_file():
-            failed[name] = _ELSEWHERE
-        elif problem := unproven(folder, by_name[name]):
-            failed[name] = f"{_REPORTED}{problem}"
-            record_path(folder, name).unlink()
-            mark_failed(folder, by_name[name], failed[name])
-    return failed
+class _Todo:
+    """The unfinished jobs, each looked for when it is asked for, and what became of them.
+
+    It is iterated once. A job that a worker reports as done counts when its files are there; else its record is
+    deleted, and it has failed.
+    """
+
+    def __init__(self, folder: Path, jobs: Jobs, *, retry: bool) -> None:
+        self.folder = folder
+        self.jobs = jobs
+        self.before = 0  # finished before
+        self.made = 0
+        self.failed: dict[str, str] = {}
+        self._noted = dict(failure_notes(folder))
+        self._retry = retry
+        self._given: dict[str, Job] = {}
+        self._left: Iterator[Job] = iter(jobs)
+
+    def __iter__(self) -> Iterator[Job]:
+        return self
+
+    def __next__(self) -> Job:
+        for job in self._left:
+            if record_path(self.folder, job.key).is_file():
+                self.before += 1
+                self._forget(job)
+            elif (reason := self._reason(job)) is not None:
+                self.failed[job.name] = reason
+            else:
+                self._given[job.name] = job
+                return job
+        raise StopIteration
+
+    def _reason(self, job: Job) -> str | None:
+        """Return why a job failed before; None if it did not, or is tried again."""
+        note = None if self._retry else self._noted.get(job.key)
+        return None if note is None else failure(note, job.digest)
+
+    def _forget(self, job: Job) -> None:
+        """Delete the note of a job that is finished."""
+        if job.key in self._noted:
+            failure_path(self.folder, job.key).unlink(missing_ok=True)
+
+    def answer(self, result: Result) -> None:
+        """Note what a worker reports; it may crash after it has written the record."""
+        job = self._given.pop(result.name, None)
+        if job is None:
+            if result.state == "done":
+                self.failed[result.name] = f"{_REPORTED}no worker was given it"
+            return
+        there = record_path(self.folder, job.key).is_file()
+        if result.state != "done" and not there:
+            self.failed[job.name] = result.message
+        elif not there:
+            self.failed[job.name] = _ELSEWHERE
+        elif problem := unproven(self.folder, job):
+            record_path(self.folder, job.key).unlink()
+            self.failed[job.name] = f"{_REPORTED}{problem}"
+            mark_failed(self.folder, job, self.failed[job.name])
+        else:
+            failure_path(self.folder, job.key).unlink(missing_ok=True)
+            self.made += 1
+
+    def end(self) -> None:
+        """Count the jobs after those that were asked for, and those of which nobody reported."""
+        for _ in self:
+            pass
+        self.before += sum(record_path(self.folder, job.key).is_file() for job in self._given.values())
 
 
-def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:
+def shard(jobs: Jobs, part: Part | None) -> Jobs:
     """Return every n-th job from the i-th on, so that expensive families spread over the shards."""
     if part is None:
-        return list(jobs)
-    i, n = part
-    if not 1 <= i <= n:
-        raise ValueError(f"shard {i}/{n}: expected i/n with 1 <= i <= n, as in 7/100")
-    return list(jobs[i - 1 :: n])
+        return jobs
+    first, step = checked_part(part)
+    return jobs[first - 1 :: step]
 
 
-def frames_done(folder: Path, jobs: list[Job]) -> int:
-    """Return the number of rendered frames, by any process: of finished clips and in the journals of others."""
-    total = 0
-    for job in jobs:
-        if (folder / "clips" / job.name).is_dir():
-            total += job.settings.frames
-        else:
-            with contextlib.suppress(OSError):
-                total += (folder / "work" / f"{job.name}.part" / "journal.jsonl").read_bytes().count(b"\n")
-    return total
+class FramesDone:
+    """Counts the rendered frames of jobs, by any process: of finished clips and in the journals of others.
+
+    Each look is at some thousand unfinished clips, and the next one at those after them.
+    """
+
+    LOOK = 2000  # clips
+
+    def __init__(self, folder: Path, jobs: Sequence[Job]) -> None:
+        self.folder = folder
+        self.jobs = jobs
+        self._finished = bytearray(len(jobs))
+        self._frames = 0  # of finished clips
+        self._begun: dict[int, int] = {}  # frames of unfinished ones
+        self._next = 0
+
+    def look(self) -> int:
+        """Return the number of frames that are known now."""
+        looked = 0
+        for _ in range(len(self.jobs)):
+            number = self._next
+            self._next = (number + 1) % len(self.jobs)
+            if self._finished[number]:
+                continue
+            self._look_at(number)
+            looked += 1
+            if looked == self.LOOK:
+                break
+        return self._frames + sum(self._begun.values())
+
+    def _look_at(self, number: int) -> None:
+        job = self.jobs[number]
+        if (self.folder / "clips" / job.key).is_dir():
+            self._finished[number] = 1
+            self._frames += job.settings.frames
+            self._begun.pop(number, None)
+            return
+        with contextlib.suppress(OSError):
+            journal = self.folder / "work" / f"{job.key}.part" / "journal.jsonl"
+            self._begun[number] = journal.read_bytes().count(b"\n")
 
 
 def write_manifest(recipe: Recipe, folder: Path) -> None:
-    """Write dataset.json from the recipe and the existing records."""
+    """Write dataset.json from the recipe."""
     lock = Lock(folder / "locks" / "manifest")
     lock.acquire(wait=True)
     with lock:
         scratch.sweep(folder)
-        jobs = {}
-        failures = _failures(folder, recipe.jobs)
-        for job in recipe.jobs:
-            listed = JobInfo(split=job.split, scene=job.scene, digest=job.digest)
-            if record_path(folder, job.name).is_file():
-                listed = replace(listed, state="done")
-            elif job.name in failures:
-                listed = replace(listed, state="failed", error=failures[job.name])
-            jobs[job.name] = listed
-        info = DatasetInfo(name=recipe.name, recipe=recipe.source, jobs=jobs, software={"qsim": VERSION})
+        series = recipe.jobs.listing.series
+        info = DatasetInfo(name=recipe.name, recipe=recipe.source, scenes=series, software={"qsim": VERSION})
         descriptions.write(folder / "dataset.json", info)
 
 
-def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
+def _begin(recipe: Recipe, folder: Path, jobs: Jobs, repair: bool) -> tuple[str, ...]:
     """Make folders and manifest; return the repairs of the manifest. `ValueError` if it is another recipe's."""
     for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
         sweep(folder / name)
     if not (folder / "dataset.json").is_file():
         _check_records(recipe, folder, repair)
-        _check_reads(recipe, folder)
+        _check_reads(folder, jobs)
         write_manifest(recipe, folder)
         return ()
     try:
-        old = Dataset.open(folder).info.jobs
+        old = Dataset.open(folder)
     except Damaged as error:
         if not repair:
             raise
         _check_records(recipe, folder, repair)
         write_manifest(recipe, folder)
         return (str(error),)
-    _check_reads(recipe, folder)
-    for job in recipe.jobs:
-        if job.name not in old:
-            raise ValueError(f"{folder}: was made from another recipe, without the clip {job.name}; use another folder")
-        if old[job.name].digest != job.digest and _is_made(folder, job):
-            raise ValueError(f"{folder}: its clip {job.name} was made with other settings; use another folder")
-    extra = sorted(set(old) - {job.name for job in recipe.jobs})
-    if extra:
-        raise ValueError(f"{folder}: holds the clip {extra[0]}, which is not in this recipe; use another folder")
-    if any(old[job.name].digest != job.digest for job in recipe.jobs):  # edited before their clips were made
+    _check_reads(folder, jobs)
+    if old.info.scenes != recipe.jobs.listing.series:
+        _check_same(recipe, old)
         write_manifest(recipe, folder)
     return ()
 
 
-def _is_made(folder: Path, job: Job) -> bool:
+def _check_same(recipe: Recipe, old: Dataset) -> None:
+    """`ValueError` unless a recipe has the clips of a data set, and made those that are made.
+
+    A recipe may be edited before its clips are made. The order of more than a thousand clips decides their folders.
+    """
+    now = recipe.jobs.listing
+    for index in range(len(now)):
+        name = now.name(index)
+        was = old.listing.find(name)
+        if was is None:
+            raise ValueError(f"{old.path}: was made from another recipe, without the clip {name}; use another folder")
+        if now.digest(index) != old.listing.digest(was) and _is_made(old.path, old.listing.key(was)):
+            raise ValueError(f"{old.path}: its clip {name} was made with other settings; use another folder")
+        if now.key(index) != old.listing.key(was) and len(now) == len(old.listing):
+            raise ValueError(f"{old.path}: lists its clips in another order, from {name} on; use another folder")
+    for index in range(len(old.listing)):
+        name = old.listing.name(index)
+        if now.find(name) is None:
+            raise ValueError(f"{old.path}: holds the clip {name}, which is not in this recipe; use another folder")
+
+
+def _is_made(folder: Path, key: str) -> bool:
     """Return whether a job's clip exists, recorded or not."""
-    return record_path(folder, job.name).is_file() or any((folder / at / job.name).exists() for at in ("clips", "work"))
+    return record_path(folder, key).is_file() or any((folder / at / key).exists() for at in ("clips", "work"))
 
 
-def _check_reads(recipe: Recipe, folder: Path) -> None:
-    """`ValueError` if a file that a scene of the user reads has changed since a clip was rendered."""
+def _check_reads(folder: Path, jobs: Jobs) -> None:
+    """`ValueError` if a file that a scene of the user reads has changed since a clip was rendered.
+
+    Of each section the first `READ` clips of this shard are looked at.
+    """
+    for part in jobs.by_section():
+        if Path(part[0].family).is_absolute():
+            _check_reads_of(folder, part[:READ])
+
+
+def _check_reads_of(folder: Path, jobs: Jobs) -> None:
+    """Check the files that the clips of one section read."""
     from qsim.dataset import scene_files
 
     seen: set[tuple[str, str, str]] = set()
-    for job in recipe.jobs:
-        if not Path(job.family).is_absolute():
-            continue
-        for about in (folder / "clips" / job.name / "clip.json", folder / "work" / job.name / "clip.json"):
+    for job in jobs:
+        for about in (folder / "clips" / job.key / "clip.json", folder / "work" / job.key / "clip.json"):
             reads: dict[str, str] = {}
             with contextlib.suppress(OSError, ValueError):  # missing or damaged: a check finds it
                 reads = read_info(about).reads
@@ -231,16 +320,19 @@ def _check_records(recipe: Recipe, folder: Path, repair: bool) -> None:
     With `repair` such a clip is made again, and only a folder without any record of this recipe is refused.
     """
     digests = {}
-    for path in (folder / "jobs").glob("*.json"):
+    root = folder / "jobs"
+    for path in root.rglob("*.json"):
         with contextlib.suppress(ValueError):
-            digests[path.stem] = read_record(path).digest
-    asked = [job for job in recipe.jobs if job.name in digests]
-    if digests and not any(digests[job.name] == job.digest for job in asked):
+            digests[path.relative_to(root).with_suffix("").as_posix()] = read_record(path).digest
+    listing = recipe.jobs.listing
+    found = {key: listing.find(Path(key).name) for key in digests}
+    asked = {key: index for key, index in found.items() if index is not None and listing.key(index) == key}
+    if digests and not any(digests[key] == listing.digest(index) for key, index in asked.items()):
         raise ValueError(f"{folder}: none of its {len(digests)} finished clips is of this recipe; use another folder")
-    other = [job.name for job in asked if digests[job.name] != job.digest]
+    other = [listing.name(index) for key, index in asked.items() if digests[key] != listing.digest(index)]
     if other and not repair:
         raise ValueError(
-            f"{folder}: its clip {other[0]} was made with other settings; use another folder, or make it "
+            f"{folder}: its clip {min(other)} was made with other settings; use another folder, or make it "
             "again with repair=True"
         )
 
@@ -273,46 +365,27 @@ def _is_data_set(folder: Path) -> bool:
     return all(item.name in FOLDERS and item.is_dir() for item in folder.iterdir())
 
 
-def _failures(folder: Path, jobs: Sequence[Job]) -> dict[str, str]:
-    """Return why unfinished jobs failed before; an unreadable note counts, one of other settings does not.
-
-    Notes of finished jobs are deleted.
-    """
-    found = {}
-    for job in jobs:
-        path = failure_path(folder, job.name)
-        if record_path(folder, job.name).is_file():
-            path.unlink(missing_ok=True)
-        elif path.is_file():
-            try:
-                note = descriptions.read(path, Failure, "add retry=True")
-                if note.digest == job.digest:
-                    found[job.name] = note.error
-            except ValueError as error:
-                found[job.name] = files.wording(error)
-    return found
-
-
 def _runner(options: Options) -> Executor:
     """Return the executor for the processes of this machine."""
     if options.workers == 0:
         return run_here
 
-    def run(jobs: list[Job], folder: Path, make: RenderJob) -> Generator[Result]:
+    def run(jobs: Iterable[Job], folder: Path, make: RenderJob) -> Generator[Result]:
         return run_local(jobs, folder, make, options.workers, options.limits)
 
     return run
 
 
 @contextlib.contextmanager
-def watching(folder: Path, jobs: list[Job], report: Progress, every: float = 0.5) -> Iterator[None]:
+def watching(folder: Path, jobs: Jobs, report: Progress, every: float = 0.5) -> Iterator[None]:
     """Call `report(frames done, frames in all)` while the block runs, for all processes and machines."""
-    total = sum(job.settings.frames for job in jobs)
+    total = jobs.frames()
+    seen = FramesDone(folder, jobs)
     stop = threading.Event()
 
     def watch() -> None:
         while not stop.wait(every):
-            report(frames_done(folder, jobs), total)
+            report(seen.look(), total)
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()

@@ -1,4 +1,10 @@
-"""Describes one job of a data set: a clip, its streams, and a digest of everything that decides their files."""
+"""Describes one job of a data set: a clip, its streams, and a digest of everything that decides their files.
+
+    digest of a job = SHA-256 of (digest of its series, seed of its scene, speed)
+
+The digest of a series covers all that its clips share, so that a data set states the digests of a million clips by
+those of its few series.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +12,9 @@ import functools
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from qsim import files, records
+from qsim import files
 from qsim.files import to_json
 from qsim.kinds import Split
 from qsim.rendering.render_settings import RenderSettings
@@ -20,7 +27,6 @@ from qsim.streams.sensing import Sensing
 class Job:
     """Description of one clip and its streams; the same job gives the same files."""
 
-    name: str
     family: str  # of the library, or the absolute path of a scene file or folder
     scene_seed: int
     speed: float  # factor on all motions
@@ -28,6 +34,17 @@ class Job:
     settings: RenderSettings
     seed: int  # of the samples
     streams: tuple[Sensing, ...]
+    block: str = ""  # folder of its files in a data set of more than a thousand clips, as "012" (series.py)
+
+    @property
+    def name(self) -> str:
+        """Return the name of the clip, as `fan_0003_x2`."""
+        return clip_name(self.stem, self.scene_seed, self.speed)
+
+    @property
+    def key(self) -> str:
+        """Return the name with the folder that holds it, as `012/fan_0003`."""
+        return f"{self.block}/{self.name}" if self.block else self.name
 
     @property
     def stem(self) -> str:
@@ -42,7 +59,12 @@ class Job:
     @property
     def digest(self) -> str:
         """Return the SHA-256 of everything that decides the job's files."""
-        described = records.plain(self, complete=True) | {"family": Path(self.family).stem}
+        return job_digest(self.series_digest, self.scene_seed, self.speed)
+
+    @property
+    def series_digest(self) -> str:
+        """Return the SHA-256 of everything that decides the files of a series, but seeds and speeds."""
+        described: dict[str, Any] = {"family": self.stem, "split": self.split, "seed": self.seed}
         described["settings"] = given(self.settings)
         described["settings"].pop("camera_path", None)  # the content of the file decides, see below
         described["streams"] = [given(stream) for stream in self.streams]
@@ -56,6 +78,22 @@ class Job:
         if own:  # the content of a file decides, not its name
             described["own"] = [_contents(path) for path in own]
         return hashlib.sha256(to_json(described)).hexdigest()
+
+
+def job_digest(series_digest: str, scene_seed: int, speed: float) -> str:
+    """Return the digest of the job of a series with this seed and speed."""
+    described = {"series": series_digest, "scene_seed": scene_seed, "speed": speed}
+    return hashlib.sha256(to_json(described)).hexdigest()
+
+
+def clip_name(stem: str, scene_seed: int, speed: float) -> str:
+    """Return the name of the clip of a scene at a speed."""
+    return f"{stem}_{scene_seed:04d}{speed_suffix(speed)}"
+
+
+def speed_suffix(speed: float) -> str:
+    """Return what a clip's name says of its speed: nothing at speed 1."""
+    return "" if speed == 1 else f"_x{speed:g}"
 
 
 State = tuple[tuple[str, tuple[int, ...]], ...]  # of files: name and what changes with the content

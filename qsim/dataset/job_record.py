@@ -1,4 +1,5 @@
-"""The record of a finished job, jobs/NAME.json: written last, so that a clip counts as finished when its record exists.
+"""The record of a finished job, jobs/KEY.json: written last, so that a clip counts as finished when its record exists.
+KEY is the clip's name with the folder of its block (series.py).
 
 Each file has one checksum: clip.json holds those of the frames, the description of a stream that of its codes, and
 every description (record and manifest included) that of its own keys.
@@ -6,30 +7,16 @@ every description (record and manifest included) that of its own keys.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from qsim import descriptions, files, records
+from qsim import descriptions, files
 from qsim.dataset.job import Job
 from qsim.kinds import Digest, Name, Split, Text
 from qsim.streams.clip import Clip
 
 CURE = "`qsim generate` makes it again with repair=True"
-
-
-@dataclass(frozen=True, kw_only=True)
-class JobInfo:
-    """A job as the manifest of a data set lists it."""
-
-    split: Split
-    digest: str  # of everything that decides the job's files
-    scene: str = ""  # FAMILY:SEED
-    state: Literal["missing", "failed", "done"] = "missing"
-    error: str = ""  # why it failed
-
-    def __post_init__(self) -> None:
-        records.settle(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,21 +41,37 @@ class JobRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """The note of a job that failed, failed/NAME.json."""
+    """The note of a job that failed, failed/KEY.json."""
 
     name: Name
     digest: Digest
     error: Text
 
 
-def record_path(folder: Path, name: str) -> Path:
+def record_path(folder: Path, key: str) -> Path:
     """Return the path of the record; the job is done when it exists."""
-    return folder / "jobs" / f"{name}.json"
+    return folder / "jobs" / f"{key}.json"
 
 
-def failure_path(folder: Path, name: str) -> Path:
+def failure_path(folder: Path, key: str) -> Path:
     """Return the path of the file that holds the reason of a failure."""
-    return folder / "failed" / f"{name}.json"
+    return folder / "failed" / f"{key}.json"
+
+
+def failure_notes(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Yield key and note of every job that failed, in the order of their keys."""
+    root = folder / "failed"
+    for path in sorted(root.rglob("*.json")):
+        yield path.relative_to(root).with_suffix("").as_posix(), path
+
+
+def failure(path: Path, digest: str) -> str | None:
+    """Return the reason in a note; an unreadable note counts, one of other settings does not: None."""
+    try:
+        note = descriptions.read(path, Failure, "add retry=True")
+    except ValueError as error:
+        return files.wording(error)
+    return note.error if note.digest == digest else None
 
 
 def read_record(path: Path) -> JobRecord:
@@ -76,15 +79,15 @@ def read_record(path: Path) -> JobRecord:
     return descriptions.read(path, JobRecord, CURE)
 
 
-def verify_job(folder: Path, name: str, expected: JobInfo) -> list[str]:
-    """Return the problems of one finished job's files; `expected` is its entry in the manifest."""
-    path = record_path(folder, name)
-    place = folder / "clips" / name
+def verify_job(folder: Path, key: str, digest: str, split: str) -> list[str]:
+    """Return the problems of one finished job's files; digest and split are those of the job."""
+    path = record_path(folder, key)
+    place = folder / "clips" / key
     problems: list[str] = []
     streams: tuple[str, ...] = ()
     try:
         record = read_record(path)
-        if (record.name, record.digest, record.split) == (name, expected.digest, expected.split):
+        if (record.name, record.digest, record.split) == (place.name, digest, split):
             streams = record.streams
         else:
             problems.append(f"{path}: is the record of another job")
@@ -96,7 +99,7 @@ def verify_job(folder: Path, name: str, expected: JobInfo) -> list[str]:
         clip = Clip.open(place)
     except (ValueError, OSError) as error:
         return [*problems, files.wording(error)]
-    if clip.info.job != expected.digest:
+    if clip.info.job != digest:
         problems.append(f"{place / 'clip.json'}: is the clip of another job")
     problems += clip.verify()
     absent = [place / "streams" / f"{stream}.json" for stream in streams if stream not in clip.streams]
@@ -109,8 +112,8 @@ def unproven(folder: Path, job: Job) -> str | None:
     Record and clip must be those of this job. Every file that they name must exist, and the codes must have the size
     in their description. `verify_job` checks the contents.
     """
-    path = record_path(folder, job.name)
-    place = folder / "clips" / job.name
+    path = record_path(folder, job.key)
+    place = folder / "clips" / job.key
     try:
         clip = Clip.open(place)
         if read_record(path) != JobRecord.of(job) or clip.info.job != job.digest:

@@ -1,10 +1,12 @@
 """Runs one job of a data set: renders a clip, senses its streams, writes its record.
 
-    work/NAME[.part]   the clip while it is rendered          (resumable, never read)
-    clips/NAME         the finished clip with its streams
-    jobs/NAME.json     the record (job_record.py); written last
-    failed/NAME.json   the reason of a failure; removed when the job succeeds
-    logs/NAME.log      date, machine, duration and memory; the only files that differ between two runs
+    work/KEY[.part]   the clip while it is rendered          (resumable, never read)
+    clips/KEY         the finished clip with its streams
+    jobs/KEY.json     the record (job_record.py); written last
+    failed/KEY.json   the reason of a failure; removed when the job succeeds
+    logs/KEY.log      date, machine, duration and memory; the only files that differ between two runs
+
+KEY is the clip's name, with the folder of its block in data sets of more than a thousand clips (series.py).
 
 A job is done when its record exists. A job killed before that is repeated from its last complete frame.
 """
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 RenderJob = Callable[[Job, Path], object]  # renders a job's clip to a path; tests use a quick one
 
 FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")  # inside a data set
+BLOCK_FOLDERS = ("clips", "jobs", "logs", "locks", "work")  # those in which every block has a folder
 
 
 @dataclass(frozen=True)
@@ -151,17 +154,18 @@ def removed(folder: Path) -> str:
 
 def run_job(job: Job, folder: Path, make: RenderJob = render_job) -> Result:
     """Run the missing steps of a job. Failures are written to failed/ and returned, not raised."""
-    lock = locks.Lock(folder / "locks" / job.name)
+    lock = locks.Lock(folder / "locks" / job.key)
     try:
+        make_block(folder, job)
         lock.acquire(wait=True)  # another process may still be ending with this job
-        if record_path(folder, job.name).is_file():
+        if record_path(folder, job.key).is_file():
             return Result(job.name, "done")
         try:
             return _do(job, folder, make)
         except Exception as error:
             if isinstance(error, OSError) and (error.errno in files.FULL or removed(folder)):
                 raise
-            _log(folder, job.name, traceback.format_exc())
+            _log(folder, job.key, traceback.format_exc())
             message = files.wording(error)
             if not isinstance(error, ValueError | OSError):
                 message = f"{type(error).__name__}: {message}"
@@ -181,32 +185,43 @@ def _do(job: Job, folder: Path, make: RenderJob) -> Result:
     """Make clip, streams and record; each is complete before the next begins."""
     started = time.monotonic()
     worked = time.process_time()
-    for path in (record_path(folder, job.name), failure_path(folder, job.name), folder / "clips" / job.name):
+    for path in (record_path(folder, job.key), failure_path(folder, job.key), folder / "clips" / job.key):
         scratch.sweep(path.parent)
     clip = _clip(job, folder, make)
     rendered = time.monotonic()
     for sensing in job.streams:
         _, line = sense(clip, sensing)
-        _log(folder, job.name, line)
-    descriptions.write(record_path(folder, job.name), JobRecord.of(job))
-    failure_path(folder, job.name).unlink(missing_ok=True)
+        _log(folder, job.key, line)
+    descriptions.write(record_path(folder, job.key), JobRecord.of(job))
+    failure_path(folder, job.key).unlink(missing_ok=True)
     seconds = (rendered - started, time.monotonic() - rendered)
     spent = f"clip {seconds[0]:.2f} s, streams {seconds[1]:.2f} s, "
     spent += f"processor {time.process_time() - worked:.2f} s, peak {peak_memory() >> 20} MiB"
-    _log(folder, job.name, f"done on {platform.node()}, process {os.getpid()}: {spent}")
+    _log(folder, job.key, f"done on {platform.node()}, process {os.getpid()}: {spent}")
     return Result(job.name, "done")
+
+
+def make_block(folder: Path, job: Job) -> None:
+    """Make the folders of a job's block, where a data set has blocks; not those of a data set that was removed."""
+    if job.block and not removed(folder):
+        for name in BLOCK_FOLDERS:
+            (folder / name / job.block).mkdir(parents=True, exist_ok=True)
+        for name in ("locks", "work"):
+            scratch.sweep(folder / name / job.block)
 
 
 def mark_failed(folder: Path, job: Job, message: str) -> None:
     """Write the reason of a failure; `generate` lists it until the job is retried."""
     note = Failure(name=job.name, digest=job.digest, error=message or "it does not say why")
-    descriptions.write(failure_path(folder, job.name), note)
+    if job.block:
+        failure_path(folder, job.key).parent.mkdir(parents=True, exist_ok=True)
+    descriptions.write(failure_path(folder, job.key), note)
 
 
 def _clip(job: Job, folder: Path, make: RenderJob) -> Clip:
     """Return the job's finished clip, rendered if it does not exist."""
-    path = folder / "clips" / job.name
-    work = folder / "work" / job.name
+    path = folder / "clips" / job.key
+    work = folder / "work" / job.key
     if path.is_symlink() and not path.is_dir():
         raise ValueError(
             f"{path}: is a symbolic link to {os.readlink(path)}, which is not there; mount or move it back, or delete "
@@ -214,7 +229,7 @@ def _clip(job: Job, folder: Path, make: RenderJob) -> Clip:
         )
     if not path.is_dir():
         if not work.is_dir():
-            _log(folder, job.name, f"rendering on {platform.node()}, process {os.getpid()}")
+            _log(folder, job.key, f"rendering on {platform.node()}, process {os.getpid()}")
             make(job, work)
         os.replace(work, path)
         files.sync_folder(path.parent)
@@ -224,7 +239,7 @@ def _clip(job: Job, folder: Path, make: RenderJob) -> Clip:
     return clip
 
 
-def _log(folder: Path, name: str, text: str) -> None:
+def _log(folder: Path, key: str, text: str) -> None:
     """Append a line with the time to the job's log."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    files.append_line(folder / "logs" / f"{name}.log", f"{now} {text}".encode())
+    files.append_line(folder / "logs" / f"{key}.log", f"{now} {text}".encode())

@@ -8,7 +8,7 @@
 
     [[scenes]]                 # one clip per family, seed and speed
     family = "fan"
-    seeds = [0, 1, 2]
+    seeds = [0, 1, 2]          # or a range, "0..999999"
     split = "train"
 
     [[streams]]                # optional; one stream per bits and light level, in every clip
@@ -34,7 +34,10 @@ from qsim import checks, files, records
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.clip_info import ClipInfo
 from qsim.dataset.job import Job
+from qsim.dataset.jobs import Jobs, JobSeries
 from qsim.dataset.recipe_file import Head, RecipeFile, ScenesSection, StreamsKeys, StreamsSection
+from qsim.dataset.series import LARGEST_SEED, seed_numbers
+from qsim.dataset.splits import check_sections
 from qsim.optics.radiometry import RGB
 from qsim.parsing import parse_toml
 from qsim.rendering.render_settings import RenderSettings
@@ -50,21 +53,28 @@ MAX_STEM = 180  # characters of a scene's name, which gets a seed, a speed and a
 
 @dataclass(frozen=True)
 class Recipe:
-    """Description of a data set: its name and jobs."""
+    """Description of a data set: its name and jobs, which may be given one by one."""
 
     name: str
-    jobs: tuple[Job, ...]
+    jobs: Jobs
     source: RecipeFile | None = None  # as it was written
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.jobs, Jobs):
+            object.__setattr__(self, "jobs", Jobs.of(self.jobs))
 
     @property
     def splits(self) -> dict[str, list[str]]:
         """Return the names of the clips of each split."""
-        return {split: [job.name for job in self.jobs if job.split == split] for split in SPLITS}
+        parts = self.jobs.by_section()
+        return {split: [name for part in parts if part[0].split == split for name in part.names()] for split in SPLITS}
 
     @property
     def digest(self) -> str:
-        """Return the SHA-256 of the jobs' digests: equal for equal jobs in equal order."""
-        return files.sha256(files.to_json([job.digest for job in self.jobs]))
+        """Return the SHA-256 of the series and of the chosen indices: equal for equal jobs in equal order."""
+        series = [records.plain(each) for each in self.jobs.listing.series]
+        chosen = [(part.start, part.stop, part.step) for part in self.jobs.chosen]
+        return files.sha256(files.to_json([series, chosen]))
 
 
 def load(path: str | Path) -> Recipe:
@@ -101,14 +111,16 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
     source = records.convert(parse_toml(path, text), RecipeFile, str(path))
     seed = source.recipe.seed or 0
     streams = _streams_of(source, seed, path)
-    jobs: list[tuple[Job, str]] = []
+    sections: list[JobSeries] = []
     for n, section in enumerate(source.scenes):
-        where = f"scenes[{n}]"
-        with _place(path, where):
-            jobs += [(job, where) for job in _jobs_of(section, source.recipe, seed, tuple(streams), path.parent)]
-    _check_jobs(jobs, path)
-    _check_streams(jobs, streams, path)
-    return Recipe(source.recipe.name, tuple(job for job, _ in jobs), source)
+        with _place(path, f"scenes[{n}]"):
+            sections.append(_jobs_of(section, source.recipe, seed, tuple(streams), path.parent))
+    if not sections:
+        raise ValueError(f"{path}: no [[scenes]], nothing to render")
+    with _place(path, ""):
+        check_sections(sections)
+    _check_streams(sections, streams, path)
+    return Recipe(source.recipe.name, Jobs(sections), source)
 
 
 @contextlib.contextmanager
@@ -117,14 +129,14 @@ def _place(path: Path, place: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError) as error:
-        raise ValueError(f"{path}: {place}: {error}") from None
+        raise ValueError(": ".join(part for part in (str(path), place, str(error)) if part)) from None
 
 
-def _jobs_of(section: ScenesSection, head: Head, seed: int, streams: tuple[Sensing, ...], beside: Path) -> list[Job]:
-    """Return one job per seed and speed of a section [[scenes]]."""
+def _jobs_of(section: ScenesSection, head: Head, seed: int, streams: tuple[Sensing, ...], beside: Path) -> JobSeries:
+    """Return the jobs of a section [[scenes]], one per seed and speed."""
     settings = _settings_of(section, head, beside)
     family = _family(section.family, beside)
-    speeds = _several(section.speed, "speed")
+    speeds = tuple(_several(section.speed, "speed"))
     if family.endswith(".xml") and speeds != (1.0,) and settings.camera_path is None:
         raise ValueError("an .xml scene has no motion, so speed changes nothing; leave it out")
     stem = Path(family).stem
@@ -136,20 +148,16 @@ def _jobs_of(section: ScenesSection, head: Head, seed: int, streams: tuple[Sensi
     if len(stem) > MAX_STEM:
         long = f"whose name has {len(stem)} characters; at most {MAX_STEM}"
         raise ValueError(f"family: clips are named after the scene, {long}")
-    return [
-        Job(
-            name=f"{stem}_{scene_seed:04d}" + ("" if speed == 1 else f"_x{speed:g}"),
-            family=family,
-            scene_seed=scene_seed,
-            speed=speed,
-            split=section.split,
-            settings=settings,
-            seed=seed,
-            streams=streams,
-        )
-        for scene_seed in seeds
-        for speed in speeds
-    ]
+    example = Job(
+        family=family,
+        scene_seed=seeds[0],
+        speed=speeds[0],
+        split=section.split,
+        settings=settings,
+        seed=seed,
+        streams=streams,
+    )
+    return JobSeries(example, seeds, speeds)
 
 
 def _settings_of(section: ScenesSection, head: Head, beside: Path) -> RenderSettings:
@@ -166,8 +174,10 @@ def _settings_of(section: ScenesSection, head: Head, beside: Path) -> RenderSett
     return RenderSettings(**given)
 
 
-def _several(value: Any, name: str) -> tuple[Any, ...]:
-    """Return one value or a list of different ones as a tuple."""
+def _several(value: Any, name: str) -> Sequence[Any]:
+    """Return one value, a list of different ones or a range as a sequence."""
+    if isinstance(value, range):
+        return value
     values = value if isinstance(value, tuple) else (value,)
     seen = set()
     for item in values:
@@ -182,10 +192,10 @@ def _seeds(section: ScenesSection) -> Sequence[int]:
     if section.seeds is not None:
         if section.count is not None or section.first is not None:
             raise ValueError("give either seeds or count, not both")
-        return _several(section.seeds, "seeds")
+        return _several(seed_numbers(section.seeds), "seeds")
     first = section.first or 0
     count = 1 if section.count is None else section.count
-    if first + count > 2**31:
+    if first + count - 1 > LARGEST_SEED:
         raise ValueError(f"seeds {first} to {first + count - 1}; the largest is 2^31 - 1")
     return range(first, first + count)
 
@@ -209,35 +219,6 @@ def _family(family: str, beside: Path) -> str:
         meant = f"{family!r}{checks.suggest(family, FAMILIES)}; there are: {', '.join(sorted(FAMILIES))}"
         raise ValueError(f"unknown family {meant}")
     return family
-
-
-def _check_jobs(jobs: list[tuple[Job, str]], path: Path) -> None:
-    """`ValueError` without jobs, for a clip listed twice, or a split that shares a scene.
-
-    A scene may be in one split only, and a family of the test split in no other split.
-    """
-    if not jobs:
-        raise ValueError(f"{path}: no [[scenes]], nothing to render")
-    seen: set[str] = set()
-    split_of: dict[str, str] = {}
-    tested = {job.stem for job, _ in jobs if job.split == "test"}
-    for job, where in jobs:
-        if job.name in seen:
-            raise ValueError(f"{path}: {where}: the clip {job.name} is listed twice; give one of them other seeds")
-        seen.add(job.name)
-        same = job.family.endswith(".xml")  # the seed of such a scene changes its samples only
-        scene = job.stem if same else job.scene
-        if split_of.setdefault(scene, job.split) != job.split:
-            cure = "an .xml scene is the same scene at every seed: leave one of them out"
-            raise ValueError(
-                f"{path}: {where}: scene {scene} is in the splits '{split_of[scene]}' and '{job.split}'; "
-                + (cure if same else "splits are by scene, at any speed: give one of them other seeds")
-            )
-        if job.split != "test" and job.stem in tested:
-            raise ValueError(
-                f"{path}: {where}: family {job.stem} is in the splits '{job.split}' and 'test'; the test split holds "
-                "families that training never sees: move its scenes"
-            )
 
 
 def _streams_of(source: RecipeFile, seed: int, path: Path) -> dict[Sensing, str]:
@@ -283,17 +264,18 @@ def _sensings_of(section: StreamsSection, seed: int, beside: Path) -> list[Sensi
     return [Sensing(**{"seed": seed} | given, bits=depth, **light) for depth in bits for light in levels]
 
 
-def _check_streams(jobs: list[tuple[Job, str]], streams: dict[Sensing, str], path: Path) -> None:
+def _check_streams(sections: list[JobSeries], streams: dict[Sensing, str], path: Path) -> None:
     """`ValueError` with the places of scene and stream for clips whose streams could not be drawn after rendering."""
     seen = set()
-    for job, scene in jobs:
+    for number, section in enumerate(sections):
+        job = section.example
         own = job.family.endswith(".py")  # no other scene may state bands
         case = (job.settings, own)
         if case in seen:
             continue
         seen.add(case)
         for sensing, stream in streams.items():
-            with _place(path, f"{stream} of {scene}"):
+            with _place(path, f"{stream} of scenes[{number}]"):
                 colour = job.settings.bands is not None or (own and filters_of(sensing) is not None)
                 clip = _unrendered(sensing.stream_name, job.settings, colour)
                 prepare(clip, replace(sensing, ppp=1.0, lux=None))

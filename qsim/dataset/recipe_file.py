@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from msgspec import Meta
 
-from qsim.kinds import Frames, Name, Seed, Speed, Split, Text
+from qsim.dataset.series import Seeds
+from qsim.kinds import Name, Seed, Speed, Split, Text
 from qsim.rendering.render_settings import RenderSettings
 from qsim.settings import section_of, setting
 from qsim.streams.sensing import Sensing
 
-Seeds = Seed | Annotated[tuple[Seed, ...], Meta(min_length=1)]
+Clips = Annotated[int, Meta(ge=1, le=1 << 31)]  # of a section
 Speeds = Speed | Annotated[tuple[Speed, ...], Meta(min_length=1)]
 
 
@@ -36,8 +37,8 @@ class ScenesKeys:
     family: Annotated[
         Text, setting('a family of scenes/; or a .py, .xml, .glb file or folder beside it ("./things")', example="fan")
     ]
-    seeds: Annotated[Seeds | None, setting("one clip each; or give count", example=[0, 1, 2])] = None
-    count: Annotated[Frames | None, setting("clips of the seeds first ... first + count - 1", unset="1", example=3)] = (
+    seeds: Annotated[Seeds | None, setting('one clip each, or "0..999"; or give count', example=[0, 1, 2])] = None
+    count: Annotated[Clips | None, setting("clips of the seeds first ... first + count - 1", unset="1", example=3)] = (
         None
     )
     first: Annotated[Seed | None, setting("first seed of a count", unset="0", example=100)] = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import itertools
 import multiprocessing
 import multiprocessing.connection
 import multiprocessing.resource_tracker
@@ -11,7 +12,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -34,15 +35,15 @@ class Limits:
     jobs: int = 8  # per process, which is then replaced, because the memory of a renderer grows
 
 
-def run_here(jobs: list[Job], folder: Path, make: RenderJob) -> Generator[Result]:
+def run_here(jobs: Iterable[Job], folder: Path, make: RenderJob) -> Generator[Result]:
     """Run the jobs one after the other in this process."""
     for job in jobs:
         yield run_job(job, folder, make)
 
 
-def run_local(jobs: list[Job], folder: Path, make: RenderJob, workers: int, limits: Limits) -> Generator[Result]:
+def run_local(jobs: Iterable[Job], folder: Path, make: RenderJob, workers: int, limits: Limits) -> Generator[Result]:
     """Run the jobs in `workers` new processes; a process that crashes loses only its job."""
-    queue = collections.deque(jobs)
+    queue = _Queue(jobs)
     crashes: collections.Counter[str] = collections.Counter()
     pool: list[_Worker] = []
     try:
@@ -52,7 +53,7 @@ def run_local(jobs: list[Job], folder: Path, make: RenderJob, workers: int, limi
                 if worker is None:
                     worker = _Worker(folder, make, limits.memory)
                     pool.append(worker)
-                worker.give(queue.popleft())
+                worker.give(queue.next())
             for connection in multiprocessing.connection.wait([w.pipe for w in pool if w.job]):
                 worker = next(w for w in pool if w.pipe is connection)
                 job, result = worker.take()
@@ -60,7 +61,7 @@ def run_local(jobs: list[Job], folder: Path, make: RenderJob, workers: int, limi
                     pool.remove(worker)
                     crashes[job.name] += 1
                     if crashes[job.name] < MAX_CRASHES:
-                        queue.append(job)
+                        queue.again(job)
                         continue
                     result = Result(
                         job.name, "crashed", f"its worker process crashed {MAX_CRASHES} times ({worker.exit_reason})"
@@ -73,6 +74,25 @@ def run_local(jobs: list[Job], folder: Path, make: RenderJob, workers: int, limi
     finally:
         for worker in pool:
             worker.close(terminate=worker.job is not None)
+
+
+class _Queue:
+    """Jobs that are taken one by one; it is true while there is one, and holds at most one beside those to repeat."""
+
+    def __init__(self, jobs: Iterable[Job]) -> None:
+        self._jobs: Iterator[Job] = iter(jobs)
+        self._waiting: collections.deque[Job] = collections.deque()
+
+    def __bool__(self) -> bool:
+        if not self._waiting:
+            self._waiting.extend(itertools.islice(self._jobs, 1))
+        return bool(self._waiting)
+
+    def next(self) -> Job:
+        return self._waiting.popleft()
+
+    def again(self, job: Job) -> None:
+        self._waiting.append(job)
 
 
 class _Worker:

@@ -154,9 +154,9 @@ def dataset_sections(path: Path, step: Callable[[], None] = lambda: None) -> lis
     below = set()
     splits = []
     total = 0
-    for name in data.names():
-        clip = Clip.open(data.path / "clips" / name)
-        split = data.info.jobs[name].split
+    for index in data.indices().tolist():
+        clip = Clip.open(data.folder(index))
+        split = data.listing.scene(index)[0].split
         splits.append(split)
         frames, height, width = clip.shape
         total += frames
@@ -165,7 +165,7 @@ def dataset_sections(path: Path, step: Callable[[], None] = lambda: None) -> lis
         found = stated(clip.info)
         rows.append(
             [
-                name,
+                clip.name,
                 split,
                 size,
                 clip.mean_radiance,

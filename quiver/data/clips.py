@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from qsim.clip.manifest import check_outside
+from qsim.dataset.clip_list import ClipList
 from qsim.dataset.dataset import Dataset
 from qsim.files import sha256, to_json
 from qsim.optics.radiometry import WHITE_PER_MEAN
@@ -23,37 +24,39 @@ __all__ = [
 ]
 
 
-def open_clips(path: Path | str | Iterable[Path | str], split: str | None = None) -> list[Clip]:
+def open_clips(path: Path | str | Iterable[Path | str], split: str | None = None) -> ClipList:
     """Return the finished clips of a data set, all or of one split; the one clip of a clip folder; those of a folder
     of clips, each of which states its split; or those of several folders, one after another.
     """
     if not isinstance(path, Path | str):
-        return [clip for folder in path for clip in open_clips(folder, split)]
+        return ClipList([part for folder in path for part in open_clips(folder, split).parts])
     path = Path(path)
     if (path / "clip.json").exists():
-        return [Clip.open(path)]
+        return ClipList.of([Clip.open(path)])
     made = sorted(found.parent for found in path.glob("*/clip.json"))
     if path.exists() and not made and not any((path / name).exists() for name in ("dataset.json", "jobs")):
         raise FileNotFoundError(f"{path}: neither a clip nor a data set (it has no clip.json and no dataset.json)")
     if not made or (path / "dataset.json").exists():
         return Dataset.open(path).clips(split)
-    return [clip for clip in map(Clip.open, made) if split in (None, clip.info.split)]
+    return ClipList.of(clip for clip in map(Clip.open, made) if split in (None, clip.info.split))
 
 
-def split_clips(path: Path | str | Iterable[Path | str], validation: str) -> tuple[list[Clip], list[Clip]]:
+def split_clips(path: Path | str | Iterable[Path | str], validation: str) -> tuple[ClipList, ClipList]:
     """Return the clips to train on, and those of the validation split that are not among them.
 
     A clip folder is in every split, so it trains. The split `train` validates on the training clips.
     """
     training = open_clips(path, "train")
     validating = open_clips(path, validation)
-    trained = {clip.path.resolve() for clip in training} if validation != "train" else set()
-    return training, [clip for clip in validating if clip.path.resolve() not in trained]
+    return training, validating if validation == "train" else validating.without(training)
 
 
 def clips_digest(*groups: Sequence[Clip]) -> str:
-    """Return the SHA-256 of the names of clips and of the checksums of their files; their folders do not count."""
-    return sha256(to_json([[(clip.name, clip.info.checksums) for clip in group] for group in groups]))
+    """Return the SHA-256 of what tells clips from others; their folders do not count.
+
+    For clips of a data set these are its series and which of them are finished, for others their names and checksums.
+    """
+    return sha256(to_json([ClipList.of(group).digest() for group in groups]))
 
 
 def unfinished(folders: Iterable[str]) -> list[str]:

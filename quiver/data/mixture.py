@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from qsim.checks import ArgumentError
+from qsim.dataset.clip_list import ClipList
 from qsim.streams.clip import Clip
 from qsim.streams.stream import Stream
 from quiver.data.illumination import Illumination, as_text, short_name, unlike_windows
@@ -39,6 +40,7 @@ def choose(
 ) -> Mixture:
     """Return the noise of the clips' streams, changed to the requested sensors, light levels [photons/pixel] and bits.
 
+    In a data set the streams of the first clip of each series stand for those of all (`ClipList.alike`).
     A requested sensor has the light, bits, clip frames per code and defects of its streams. Without any, it has light,
     bits and clip frames of other streams, and the defects of its file, at `temperature` [degrees C]. Without streams,
     the default sensor and light are used. Codes over `planes` clip frames are those of `Illumination.over`.
@@ -68,7 +70,7 @@ def choose(
 
 
 def _streams(clips: Sequence[Clip]) -> list[Stream]:
-    return [clip.stream(name) for clip in clips for name in clip.streams]
+    return [clip.stream(name) for clip in ClipList.of(clips).alike() for name in clip.streams]
 
 
 def _is_file(sensor: str) -> bool:

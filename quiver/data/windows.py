@@ -17,6 +17,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ import torch
 from numpy import ndarray as Array
 from torch.utils.data import Dataset, Sampler
 
+from qsim.dataset.clip_list import ClipList
 from qsim.keys import Key
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
@@ -54,6 +56,8 @@ Prepare = Callable[[Codes], Mapping[str, torch.Tensor]]
 TRAINING = 1
 VALIDATION = 2
 STILL = 3
+SHUFFLED = 1 << 16  # numbers of an epoch that are shuffled together
+KEPT = 256  # clips that stay open, with what draws their codes
 # Turns that keep the direction in which rows (0) or columns (1) are read: none, and mirrored along them
 TURNS_OF_ROWS = ((0, 4), (0, 6))
 
@@ -116,28 +120,30 @@ class Windows(Dataset[dict[str, Any]]):
         `fixed` is for validation: one window per clip and light level, from the middle of the clip, not turned, equal
         in every epoch.
         """
-        check_clips(clips, settings)
-        self.clips = tuple(clips)
+        self.clips = ClipList.of(clips)
+        alike = self.clips.alike()
+        check_clips(alike, settings)
         self.settings = settings
         self.fixed = fixed
         self.prepare = prepare
         if settings.lights is None:
-            self.noise = choose(clips)
+            self.noise = choose(self.clips)
         else:
             self.noise = Mixture(tuple(light.stated() for light in settings.lights))
         for noise in self.noise.noises:
-            _check_codes(clips, noise, settings)
-        lit = {clip.camera is None: clip for clip in reversed(clips)}  # of clips that are alike the first
-        sized = {(clip.camera is None, clip.shape[1:], clip.origin): clip for clip in reversed(clips)}  # for defects
+            _check_codes(alike, noise, settings)
+        lit = {clip.camera is None: clip for clip in reversed(alike)}  # of clips that are alike the first
+        sized = {(clip.camera is None, clip.shape[1:], clip.origin): clip for clip in reversed(alike)}  # for defects
         for noise in self.noise.noises:
             for clip in (lit if noise.defects is None else sized).values():
                 check_windows(noise, clip)
                 if prepare is not None:  # from the response, which some sensors do not have
                     noise.draw(clip).sensor.response(clip.exposure * noise.planes, points=2)
-            for clip in clips:
+            for clip in alike:
                 check_slices(noise, clip)
-        self.length = len(clips) * (len(self.noise.noises) if fixed else repeats)
-        self._draws: dict[tuple[int, int], tuple[Draw, Array | None, Sensor]] = {}
+        self.length = len(self.clips) * (len(self.noise.noises) if fixed else repeats)
+        self._draws: dict[tuple[int, int], tuple[Draw, Array | None, Sensor]] = {}  # of the clips that were used last
+        self._opened: dict[int, Clip] = {}  # the same
 
     def __repr__(self) -> str:
         return f"<Windows of {len(self.clips)} clips; {'; '.join(self.noise.lines)}>"
@@ -151,9 +157,9 @@ class Windows(Dataset[dict[str, Any]]):
             return self._middle(n % self.length)
         settings = self.settings
         epoch, index = divmod(n, self.length)
-        clip = int(np.random.default_rng((settings.seed, epoch)).permutation(self.length)[index]) % len(self.clips)
+        clip = shuffled(self.length, (settings.seed, epoch), index) % len(self.clips)
         rng = np.random.default_rng((settings.seed, epoch, index))
-        length, height, width = self.clips[clip].shape
+        length, height, width = self.clip(clip).shape
         frame = int(rng.integers(length - settings.frames + 1))
         drift = self._drift(clip, rng)
         y, x = (
@@ -164,7 +170,7 @@ class Windows(Dataset[dict[str, Any]]):
         turn = int(rng.integers(8)) if settings.flips else 0
         backwards = bool(rng.integers(2)) if settings.reverse else False
         timing = self.noise.noises[light].timing
-        codes = len(timing.over(self.clips[clip]))
+        codes = len(timing.over(self.clip(clip)))
         return WindowPlace(
             clip=clip,
             start=frame * (codes - settings.frames + 1) // (length - settings.frames + 1),
@@ -182,20 +188,27 @@ class Windows(Dataset[dict[str, Any]]):
         settings = self.settings
         if not settings.drift or rng.random() < 0.5:
             return 0, 0
-        room = [(side - settings.crop) // max(1, settings.frames - 1) for side in self.clips[clip].shape[1:]]
+        room = [(side - settings.crop) // max(1, settings.frames - 1) for side in self.clip(clip).shape[1:]]
         dy, dx = (int(rng.integers(-most, most + 1)) for most in (min(settings.drift, r) for r in room))
         return dy, dx
 
     def _middle(self, index: int) -> WindowPlace:
         settings = self.settings
         clip = index % len(self.clips)
-        _, height, width = self.clips[clip].shape
+        _, height, width = self.clip(clip).shape
         light = index // len(self.clips)
-        start = (len(self.noise.noises[light].timing.over(self.clips[clip])) - settings.frames) // 2
+        start = (len(self.noise.noises[light].timing.over(self.clip(clip))) - settings.frames) // 2
         y = (height - settings.crop) // 2
         x = (width - settings.crop) // 2
         key = Key(seed=settings.seed, clip=index, stage=VALIDATION)
         return WindowPlace(clip, start, y, x, (0, 0), light, 0, False, key)
+
+    def clip(self, number: int) -> Clip:
+        """Return the opened clip of a number; those that were used last stay open."""
+        if number not in self._opened:
+            keep_last(self._opened, KEPT - 1)
+            self._opened[number] = self.clips[number]
+        return self._opened[number]
 
     def spread(self, count: int) -> list[int]:
         """Return the numbers of at most `count` fixed windows, spread over the clips and over the light levels."""
@@ -213,7 +226,7 @@ class Windows(Dataset[dict[str, Any]]):
     @own_numbers
     def __getitem__(self, n: int) -> dict[str, Any]:
         place = self.place(n)
-        clip = self.clips[place.clip]
+        clip = self.clip(place.clip)
         noise = self.noise.noises[place.light]
         settings = self.settings
         draw, bad, behind = self._draw(place)
@@ -262,7 +275,7 @@ class Windows(Dataset[dict[str, Any]]):
 
     def photons_of(self, place: WindowPlace) -> tuple[Array, Array]:
         """Return the expected photons of the exposed and of the sharp window, float64 [T, h, w] each, turned."""
-        clip = self.clips[place.clip]
+        clip = self.clip(place.clip)
         draw, _, _ = self._draw(place)
         settings = self.settings
         light = WindowLight.of(self.noise.noises[place.light], draw, clip, place, settings.frames, settings.crop)
@@ -275,7 +288,7 @@ class Windows(Dataset[dict[str, Any]]):
 
     def _sharp(self, place: WindowPlace, exposed: Array) -> Array:
         """Return the sharp photons [T, h, w] of a window, turned; those that are exposed where a clip has no others."""
-        clip = self.clips[place.clip]
+        clip = self.clip(place.clip)
         draw, _, _ = self._draw(place)
         if draw.timing == Timing() and not (has_sharp(clip) or draw.diffraction):
             return exposed
@@ -290,7 +303,7 @@ class Windows(Dataset[dict[str, Any]]):
 
     def _at_rest(self, place: WindowPlace) -> Array:
         """Return the photons [h, w] of the centre code, turned, of a scene that rests there: without motion blur."""
-        clip = self.clips[place.clip]
+        clip = self.clip(place.clip)
         frames = self.settings.frames
         draw, _, _ = self._draw(place)
         i = frames - 1 - frames // 2 if place.backwards else frames // 2
@@ -300,8 +313,9 @@ class Windows(Dataset[dict[str, Any]]):
     def _draw(self, place: WindowPlace) -> tuple[Draw, Array | None, Sensor]:
         """Return what draws the codes of a place's clip and noise, its defective pixels, and the sensor behind them."""
         if (place.clip, place.light) not in self._draws:
+            keep_last(self._draws, KEPT - 1)
             noise = self.noise.noises[place.light]
-            clip = self.clips[place.clip]
+            clip = self.clip(place.clip)
             draw = noise.draw(clip)
             self._draws[place.clip, place.light] = draw, *behind_defects(noise, draw, clip)
         return self._draws[place.clip, place.light]
@@ -342,6 +356,33 @@ def windows(
     if planes is not None:
         settings = replace(settings, lights=choose(clips, planes=planes).noises)
     return Windows(clips, settings, repeats=repeats)
+
+
+@lru_cache(maxsize=4)
+def _order(count: int, seed: tuple[int, ...]) -> Array:
+    return np.random.default_rng(seed).permutation(count)
+
+
+def shuffled(length: int, seed: tuple[int, int], index: int) -> int:
+    """Return number `index` of the shuffled numbers 0 ... length - 1, in memory that does not grow with the length.
+
+    Each `SHUFFLED` of them are shuffled together: those with the same remainder, so that they are spread over all.
+    """
+    parts = -(-length // SHUFFLED)
+    if parts == 1:
+        return int(_order(length, seed)[index])
+    least, longer = divmod(length, parts)
+    part = min(index // (least + 1), longer)
+    if part == longer:
+        part += (index - longer * (least + 1)) // least
+    start = part * least + min(part, longer)
+    return int(_order(least + (part < longer), (*seed, part))[index - start]) * parts + part
+
+
+def keep_last(kept: dict[Any, Any], count: int) -> None:
+    """Leave at most `count` entries of a dictionary, those that were added last."""
+    while len(kept) > count:
+        del kept[next(iter(kept))]
 
 
 def turned(window: Array, place: WindowPlace) -> Array:

@@ -80,7 +80,7 @@ def scene_of(clip: Clip) -> str:
     return clip.name if scene is None else f"{scene.family}:{scene.seed}"
 
 
-def clips_of(comparison: Comparison) -> list[Clip]:
+def clips_of(comparison: Comparison) -> Sequence[Clip]:
     """Return the scored clips: of a data set, or the imported ones of a test set of the paper."""
     if comparison.test_set is None:
         return open_clips(comparison.source, comparison.split)
@@ -214,7 +214,7 @@ def check(comparison: Comparison) -> list[Clip]:
     """Return the scored clips; `ValueError` if there are none, or if they or the lights do not fit the settings."""
     if comparison.stream is not None and (comparison.published or len(comparison.lights) > 1):
         raise ValueError("a stored stream has one light level and one exposure; leave out ppp= and published=True")
-    clips = clips_of(comparison)
+    clips = list(clips_of(comparison))
     if not clips:
         raise ValueError(f"{comparison.source}: no finished clip in split {comparison.split!r}")
     names = [clip.name for clip in clips]

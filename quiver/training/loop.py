@@ -88,7 +88,7 @@ def make_windows(
         split = settings.validation_split
         warnings.warn(f"{names}: no clip in split '{split}'; validating on training clips", stacklevel=2)
         validation = training
-    side = min(VALIDATION_SIDE, *(min(clip.shape[1:]) for clip in validation)) // multiple * multiple
+    side = min(VALIDATION_SIDE, *(min(clip.shape[1:]) for clip in validation.alike())) // multiple * multiple
     middle = replace(window, drift=0, frames=frames or system.frames, crop=max(side, multiple), ceiling=math.inf)
     fixed = Windows(validation, middle, fixed=True, prepare=system.prepare)
     return windows, Subset(fixed, fixed.spread(settings.validation_windows))

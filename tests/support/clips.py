@@ -84,11 +84,7 @@ def colour_clip(path: Path, frames: int = 3, height: int = 7, width: int = 9, **
 def write_dataset(path: Path, splits: dict[str, int], **options: object) -> Path:
     """A data set folder with so many clips per split, generated with our pattern in place of a renderer."""
     settings = RenderSettings(frames=14, height=36, width=44, frame_rate=2000.0)
-    jobs = tuple(
-        Job(f"{split}_{i}", f"{split}_family", i, 1.0, split, settings, 0, ())
-        for split, count in splits.items()
-        for i in range(count)
-    )
+    jobs = tuple(Job(split, i, 1.0, split, settings, 0, ()) for split, count in splits.items() for i in range(count))
 
     def make(job: Job, target: Path) -> object:
         return write_clip(target, seed=job.scene_seed + 100 * len(job.split), job=job.digest, **options)

@@ -14,14 +14,15 @@ from unittest import mock
 
 import numpy as np
 
-from qsim import records
+from qsim import descriptions, records
 from qsim.clip.clip_info import PHYSICAL
 from qsim.clip.writer import ClipWriter
 from qsim.dataset import recipe
-from qsim.dataset.dataset import Dataset
+from qsim.dataset.dataset import Dataset, DatasetInfo
 from qsim.dataset.generation import Options
 from qsim.dataset.job import Job
 from qsim.dataset.provenance import origin
+from qsim.dataset.series import Series
 from qsim.optics.camera import Camera
 from qsim.streams.clip import Clip
 
@@ -169,3 +170,14 @@ def moved(folder: Path, name: str, place: Path) -> Path:
     shutil.move(folder / "clips" / name, place)
     (folder / "clips" / name).symlink_to(place)
     return folder / "clips" / name
+
+
+def write_records(folder: Path) -> None:
+    """Write a data set of two finished clips, a_0000 to train and b_0000 to test, as far as their names."""
+    series = [
+        Series(stem=stem, seeds=0, split=split, digest="0" * 64) for stem, split in (("a", "train"), ("b", "test"))
+    ]
+    descriptions.write(folder / "dataset.json", DatasetInfo(name="demo", scenes=tuple(series)))
+    (folder / "jobs").mkdir(exist_ok=True)
+    for each in series:
+        (folder / "jobs" / f"{each.stem}_0000.json").touch()

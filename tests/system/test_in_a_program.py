@@ -133,7 +133,7 @@ def examples(shared) -> dict[str, Any]:
         "Clip": clip,
         "ClipInfo": clip.info,
         "ClipWriter": qsim.ClipWriter(shared / "other", tiny_clip.meta()),
-        "Dataset": qsim.Dataset(shared, DatasetInfo(name="d", jobs={})),
+        "Dataset": qsim.Dataset(shared, DatasetInfo(name="d")),
         "Key": KEY,
         "PlaneSums": qsim.PlaneSums(planes=7),
         "Scene": plate(Spin((0, 0, 1), 200.0)),

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clips import write_clip, write_dataset
+from fakes import write_records
 from waves import wave_clip
 
-from qsim import files
 from qsim.cli import demo
 from qsim.cli import main as qsim
 from qsim.scratch import is_scratch
@@ -130,7 +130,7 @@ def longer(place: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     def call(words: list[str], capture: bool) -> str:
         if words[3] == "generate":
             (place / "r" / "data").mkdir(exist_ok=True)
-            files.write_json(place / "r" / "data" / "dataset.json", {"jobs": {"b": {"split": "test"}}})
+            write_records(place / "r" / "data")
         return "{}"
 
     monkeypatch.setattr(demo, "call", call)

@@ -57,17 +57,11 @@ def rewritten(path: Path, change: Callable[[dict], object]) -> None:
 def test_hostile_names_and_splits_leave_the_output_folder_alone(
     data: Path, name: object, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """In every place that becomes a path: name and split of a clip, names and splits of jobs, of a record's streams."""
+    """In every place that becomes a path: names and splits of clips, series, records and streams."""
     monkeypatch.chdir(data.parent)
     manifest = data / "dataset.json"
     about = data / "clips" / "fan_0000" / "clip.json"
     record = data / "jobs" / "fan_0000.json"
-
-    def job(found: dict, key: object) -> None:
-        if isinstance(key, str):
-            found["jobs"] = {key: found["jobs"]["fan_0000"]}
-        else:
-            found["jobs"]["fan_0000"]["split"] = key
 
     def streams(found: dict) -> None:
         found["streams"] = [str(name)]
@@ -75,8 +69,9 @@ def test_hostile_names_and_splits_leave_the_output_folder_alone(
     attacks = [
         (about, lambda found: found.update(name=name)),
         (about, lambda found: found.update(split=name)),
-        (manifest, lambda found: job(found, name)),
-        (manifest, lambda found: found["jobs"]["fan_0000"].update(split=name)),
+        (manifest, lambda found: found["scenes"][0].update(stem=name)),
+        (manifest, lambda found: found["scenes"][0].update(split=name)),
+        (manifest, lambda found: found["scenes"][0].update(seeds=name)),
         (record, streams),
     ]
     commands = [

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes import write_records
 
 import qsim.cli.program
 import quiver.cli.program
@@ -30,8 +31,7 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, list[str]]]:
         found.append((program, arguments))
         if arguments[0] == "generate":
             values["output"].mkdir()
-            jobs = {"a": {"split": "train"}, "b": {"split": "test"}}
-            (values["output"] / "dataset.json").write_text(json.dumps({"jobs": jobs}))
+            write_records(values["output"])
         return "{}"
 
     monkeypatch.setattr(demo, "call", parse)
@@ -53,7 +53,7 @@ def test_every_step_is_a_command_of_the_programs(ran, tmp_path: Path):
 
 
 def test_a_finished_restoration_is_not_repeated(ran, tmp_path: Path):
-    (tmp_path / "b_shipped.json").touch()
+    (tmp_path / "b_0000_shipped.json").touch()
     demo.steps(tmp_path, quiet=True)
     restored = [words for program, words in ran if words[0] == "restore"]
     assert len(restored) == 2

@@ -25,6 +25,7 @@ from acting import (
     threads,
 )
 from clips import colour_clip, write_clip
+from fakes import write_records
 
 import qsim.cli.program
 from qsim.cli import look
@@ -120,6 +121,7 @@ SITUATIONS = (
     Situation(GENERATE, names, before=damage, codes=(0, 1), only=("repair",), slow=True),
     Situation("plan t.toml", stdout, slow=True),
     Situation("check clip", stdout),
+    Situation("check rest", stdout, codes=(1,), only=("shard",)),
     # compare, preview, report, explore
     Situation("compare clip", stdout),
     Situation("preview clip", stdout),
@@ -339,6 +341,8 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
         bands.sense("spad512s", ppp=0.4, bits=1, seed=seed, name=name)
     colour_clip(folder / "coloured")
     write_camera_path(folder / "path.json", Camera(2e-4, 2.8, 1e-5, 16, 24, origin=(0, 0, 3)), frames=2, frame_rate=2e3)
+    (folder / "rest").mkdir()
+    write_records(folder / "rest")
     np.save(folder / "codes.npy", rng.integers(0, 4, (3, 16, 24)).astype(np.uint8))
     np.save(folder / "values.npy", rng.random((3, 16, 24)).astype(np.float32))
     np.save(folder / "light.npy", rng.integers(0, 60000, (3, 16, 24)).astype(np.uint16))

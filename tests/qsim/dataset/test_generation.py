@@ -96,7 +96,7 @@ def test_a_failing_job_is_listed_and_retried(tmp_path: Path, undisturbed: dict[s
     why = "scene tumble: no light and no glowing body"
     first = generate(SMALL, tmp_path / "d", HERE, make=fail_on_tumble)
     assert (first.done, first.failed) == (2, {"tumble_0004": why})
-    assert Dataset.open(tmp_path / "d").info.jobs["tumble_0004"].state == "failed"
+    assert Dataset.open(tmp_path / "d").failed() == {"tumble_0004": why}
     again = generate(SMALL, tmp_path / "d", HERE, make=make)
     assert (again.made, again.failed) == (0, {"tumble_0004": why}), "it is retried only when asked"
     assert "ValueError" in (tmp_path / "d" / "logs" / "tumble_0004.log").read_text()
@@ -227,7 +227,7 @@ def test_a_folder_of_somebody_else_is_still_refused(tmp_path: Path):
 
 def test_progress_counts_the_frames_of_whoever_renders(tmp_path: Path):
     """All frames of finished clips, the lines of the journal of an unfinished one, none of the others."""
-    jobs_wanted = list(SMALL.jobs)
+    jobs_wanted = SMALL.jobs
     total = sum(job.settings.frames for job in jobs_wanted)
     first, second, _ = jobs_wanted
     part = tmp_path / "work" / f"{second.name}.part"
@@ -305,7 +305,7 @@ def test_an_answer_counts_only_when_its_files_agree(tmp_path: Path, lie: str):
     folder = tmp_path / "d"
 
     def run(chosen, place, maker):
-        for job in reversed(chosen):
+        for job in reversed(list(chosen)):
             found = job_runner.run_job(job, place, maker)
             if job.name == "fan_0000":
                 LIES[lie](place, place / "jobs" / "fan_0000.json")
@@ -316,11 +316,12 @@ def test_an_answer_counts_only_when_its_files_agree(tmp_path: Path, lie: str):
     assert found.failed["fan_0000"].startswith("a worker reports that it is done, but ")
     opened = Dataset.open(folder)
     assert opened.names() == ["fan_0001", "tumble_0004"]
-    assert opened.info.jobs["fan_0000"].state == "failed"
+    assert list(opened.failed()) == ["fan_0000"]
 
 
 def test_an_answer_for_a_job_that_nobody_asked_for(tmp_path: Path):
     def run(chosen, place, maker):
+        assert [job.name for job in chosen] == ["fan_0000", "fan_0001", "tumble_0004"]
         yield job_runner.Result("fan_0099", "done")
         yield job_runner.Result("fan_0000", "done")
 

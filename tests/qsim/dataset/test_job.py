@@ -55,7 +55,7 @@ def test_a_setting_that_is_off_changes_no_digest():
     """Not even one that does not exist yet: a record with one more field of any default has the same digest."""
     settings = RenderSettings(frames=3, height=8, width=9, frame_rate=2000.0)
     stream = Sensing("quiver-physical", bits=3, ppp=3.25)
-    job = Job("a", "fan", 1, 1.0, "train", settings, 7, (stream,))
+    job = Job("fan", 1, 1.0, "train", settings, 7, (stream,))
     for record, name in ((settings, "settings"), (stream, "streams")):
         kind = type(record)
         for added in (None, False, 1, 0.0):

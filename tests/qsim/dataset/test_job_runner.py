@@ -120,9 +120,10 @@ def failing(name: str, step: int, number: int, monkeypatch: pytest.MonkeyPatch):
         return action(*args, **kwargs)
 
     def run(chosen, place, maker):
+        job = next(iter(chosen))
         with monkeypatch.context() as patch:
             patch.setattr(os, name, fail)
-            yield job_runner.run_job(chosen[0], place, maker)
+            yield job_runner.run_job(job, place, maker)
 
     return run
 

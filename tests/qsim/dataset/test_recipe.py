@@ -125,7 +125,14 @@ MISTAKES = [
     ('name = "tiny"', 'name = "../tiny"', "recipe.name: expected a name of letters, digits"),
     ('"fan"', '"fann"', r"scenes\[0\]: unknown family 'fann' \(did you mean 'fan'\?\)"),
     ("seeds = [0, 2]", "seeds = [0, 0]", r"scenes\[0\]: seeds: 0 is listed twice"),
-    ("seeds = [0, 2]", "seeds = []", r"scenes\[0\].seeds: expected a whole number .*, or a list of them, got \[\]"),
+    (
+        "seeds = [0, 2]",
+        "seeds = []",
+        r"scenes\[0\].seeds: expected a whole number .* or a range of seeds, .*, got \[\]",
+    ),
+    ("seeds = [0, 2]", 'seeds = "7..3"', r'scenes\[0\]: seeds: "7..3" is no range; give "FIRST..LAST"'),
+    ("seeds = [0, 2]", 'seeds = "0-9"', r"scenes\[0\].seeds: expected .* a range of seeds, .* got '0-9'"),
+    ("seeds = [0, 2]", 'seeds = "0..2147483648"', r"scenes\[0\]: seeds: .* at most 2147483647"),
     ("seeds = [0, 2]", "seeds = [0, -1]", r"scenes\[0\].seeds\[1\]: expected a whole number from 0 to 2147483647, got"),
     ("seeds = [0, 2]", "seeds = [0]\ncount = 3", r"scenes\[0\]: give either seeds or count"),
     ("speed = [1.0, 2.5]", "speed = inf", r"scenes\[0\].speed: expected a number .*, or a list of them, got inf"),
@@ -149,6 +156,12 @@ MISTAKES = [
     ('"quiver-physical"\nbits = [1, 3]', '"spad512s"\ngroup = true', "the bits of a code"),
     ('"quiver-physical"', '"spad512s"\ngroup = true', "3 frames are too few for one code of 7 planes"),
     ('split = "test"', f'split = "test"\n{AGAIN}"fan"', r"scenes\[2\]: the clip fan_0000 is listed twice"),
+    ('split = "test"', f'split = "test"\n{AGAIN}"fan"\nseeds = "1..9"', r"scenes\[2\]: the clip fan_0002 is listed"),
+    (
+        'split = "test"',
+        f'split = "val"\n{AGAIN}"tumble"\nseeds = [9, 6]\nspeed = 2',
+        r"scenes\[2\]: scene tumble:6 is in",
+    ),
     ('split = "test"', f'split = "test"\n{AGAIN}"tumble"', r"scenes\[2\]: family tumble is in the splits 'train' and"),
     ('split = "test"', f'split = "val"\n{AGAIN}"tumble"\nfirst = 5\nspeed = 2', r"scenes\[2\]: .*splits 'val' and"),
     ("ppp = [0.5, 3.25]", f"ppp = 3.25\n{STREAMS}", r"streams\[1\]: two \[\[streams"),
@@ -413,7 +426,7 @@ def test_the_work_of_reading_a_recipe_is_linear(kind: str):
 def accepted_by_the_jobs(stem: str, folder: Path) -> bool:
     """Return whether a job with such a name makes its clip, writes its record, and removes leftovers."""
     found = RenderSettings(1, 2, 3, 2000.0)
-    job = Job(f"{stem}_0000_x0.001", f"{stem}.py", 0, 1.0, "train", found, 0, ())
+    job = Job(f"{stem}.py", 0, 0.001, "train", found, 0, ())
     for name in ("jobs", "failed", "clips", "logs", "locks", "work"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     try:

@@ -213,7 +213,7 @@ def test_a_data_set_is_drawn_again_clip_by_clip(tmp_path, capsys):
     found = checking.redraw(path)
     assert len(found) == 3
     assert not any(one.differ for one in found)
-    clip = Clip.open(path / "clips" / "train_1")
+    clip = Clip.open(path / "clips" / "train_0001")
     stored_again(clip, clip.stream("s"), clip.stream("s").codes() ^ 1)
     capsys.readouterr()
     assert program.main(["check", str(path), "--redraw"]) == 1
@@ -226,15 +226,15 @@ def test_a_damaged_clip_is_named_and_the_others_are_drawn_again(tmp_path, capsys
     """The damage of one clip ended the command, and what `check` had found in others was lost."""
     path = write_dataset(tmp_path / "set", {"train": 3})
     assert program.main(["sense", str(path), "--bits", "3", "--ppp", "3.25", "-o", "s"]) == 0
-    about = path / "clips" / "train_1" / "clip.json"
+    about = path / "clips" / "train_0001" / "clip.json"
     about.write_text(about.read_text() + "x")
-    (path / "clips" / "train_2" / "streams" / "s.npy").unlink()
+    (path / "clips" / "train_0002" / "streams" / "s.npy").unlink()
     capsys.readouterr()
     assert program.main(["check", str(path), "--redraw"]) == 1
     out = capsys.readouterr().out
     assert f"{about}: not readable as JSON" in out
-    assert f"{path / 'clips' / 'train_2' / 'streams' / 's.npy'}: missing" in out
-    assert "train_1/streams/s.npy: not drawn again" in out
+    assert f"{path / 'clips' / 'train_0002' / 'streams' / 's.npy'}: missing" in out
+    assert "train_0001/streams/s.npy: not drawn again" in out
     assert "drawn again: 1 of 3 streams" in out
     assert program.main(["check", str(about.parent), "--redraw"]) == 1
     assert "drawn again: 0 of 1 streams, 0 codes; so nothing is known of them" in capsys.readouterr().out
@@ -244,7 +244,7 @@ def test_what_is_said_of_a_recipes_streams_mends_them(tmp_path, capsys):
     """Every checksum fits the wrong codes; when the file is deleted, `generate --repair` draws them again."""
     settings = RenderSettings(frames=14, height=36, width=44, frame_rate=2000.0)
     sensing = Sensing("quiver-physical", bits=3, ppp=3.25, name="s")
-    recipe = Recipe("tiny", (Job("one", "family", 0, 1.0, "train", settings, 0, (sensing,)),))
+    recipe = Recipe("tiny", (Job("family", 0, 1.0, "train", settings, 0, (sensing,)),))
 
     def make(job: Job, target: Path, wrong: bool) -> Clip:
         clip = write_clip(target, job=job.digest)
@@ -253,7 +253,7 @@ def test_what_is_said_of_a_recipes_streams_mends_them(tmp_path, capsys):
 
     path = tmp_path / "set"
     generate(recipe, path, Options(workers=0), make=lambda job, target: make(job, target, True))
-    stream = path / "clips" / "one" / "streams" / "s.npy"
+    stream = path / "clips" / "family_0000" / "streams" / "s.npy"
     assert program.main(["check", str(path)]) == 0
     capsys.readouterr()
     assert program.main(["check", str(path), "--redraw"]) == 1

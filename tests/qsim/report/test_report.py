@@ -117,8 +117,13 @@ def test_a_data_set_is_a_table_and_a_clip_of_each_split(tmp_path):
     page = report.build_page(data, progress=lambda done, total: steps.append((done, total)))
     assert steps == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert page.count('class="player"') == 3
-    assert "Data set tiny has 4 clips (1 test, 2 train, 1 val) with 56 frames in all." in page
-    assert re.findall(r"<h2>(.*?)</h2>", page) == ["Data set tiny", "Clip test_0", "Clip train_0", "Clip val_0"]
+    assert "Data set tiny has 4 clips (2 train, 1 val, 1 test) with 56 frames in all." in page
+    assert re.findall(r"<h2>(.*?)</h2>", page) == [
+        "Data set tiny",
+        "Clip test_0000",
+        "Clip train_0000",
+        "Clip val_0000",
+    ]
     assert "4 clips; motion in the middle frame" in page
 
 

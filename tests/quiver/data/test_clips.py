@@ -16,10 +16,10 @@ def test_a_clip_that_trains_does_not_validate(tiny_dataset):
     inside = open_clips(tiny_dataset, "val")[0].path
     other = Path(f"{inside.parent}/../clips/{inside.name}")
     training, validating = split_clips((tiny_dataset, other), "val")
-    assert [clip.name for clip in training] == ["train_0", "train_1", "train_2", "val_0"]
-    assert [clip.name for clip in validating] == ["val_1"]
+    assert [clip.name for clip in training] == ["train_0000", "train_0001", "train_0002", "val_0000"]
+    assert [clip.name for clip in validating] == ["val_0001"]
     assert split_clips(inside, "val")[1] == []
-    assert [[clip.name for clip in part] for part in split_clips(inside, "train")] == [["val_0"], ["val_0"]]
+    assert [[clip.name for clip in part] for part in split_clips(inside, "train")] == [["val_0000"], ["val_0000"]]
 
 
 def test_clips_are_known_by_their_names_and_files(tiny_dataset, tmp_path):
@@ -35,7 +35,7 @@ def test_clips_are_known_by_their_names_and_files(tiny_dataset, tmp_path):
 def test_a_data_set_that_lacks_clips_is_named(tmp_path, tiny_dataset, away):
     data = write_dataset(tmp_path / "d", {"train": 3})
     for i in range(away):
-        (data / f"jobs/train_{i}.json").unlink()
+        (data / f"jobs/train_{i:04d}.json").unlink()
     clip = open_clips(tiny_dataset)[0].path
     lines = unfinished([str(data), str(clip), str(tiny_dataset)])
     told = [f"{data}: the data set lacks {away} of its clips"] if away else []

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import pickle
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from clips import ClipMaker, sliding_pattern
+from clips import ClipMaker, sliding_pattern, write_clip
 from sensor_files import QIS, sensor_file
 from stats import assert_mean
 from torch.utils.data import DataLoader
@@ -18,7 +19,7 @@ from qsim.streams.photons import clip_photons, light_level
 from quiver.data.clips import open_clips
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
-from quiver.data.windows import Batches, Windows, WindowSettings, windows
+from quiver.data.windows import Batches, Windows, WindowSettings, shuffled, windows
 
 ROOT = Path(__file__).parents[3]
 
@@ -328,3 +329,28 @@ def test_windows_can_be_listed(make_clip: ClipMaker):
     """The loop never ended."""
     data = three_clips(make_clip)
     assert len(list(data)) == len(data) == 6
+
+
+@pytest.mark.parametrize("length", [1, 7, 8, 9, 23, 64, 65])
+def test_a_long_epoch_holds_every_window_once_and_spreads_each_part(length: int, monkeypatch: pytest.MonkeyPatch):
+    """As one permutation where it is short; else parts of 8, each from all over the set."""
+    whole = np.random.default_rng((3, 1)).permutation(length).tolist()
+    monkeypatch.setattr(sys.modules[Windows.__module__], "SHUFFLED", 8)
+    found = [shuffled(length, (3, 1), index) for index in range(length)]
+    assert sorted(found) == list(range(length))
+    if length <= 8:
+        assert found == whole
+    else:
+        parts = -(-length // 8)
+        assert all(max(found[i : i + 4]) - min(found[i : i + 4]) >= parts for i in range(0, length - 8, 8))
+        assert found != [shuffled(length, (3, 2), index) for index in range(length)]
+
+
+def test_no_more_clips_stay_open_than_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys.modules[Windows.__module__], "KEPT", 2)
+    clips = [write_clip(tmp_path / f"{i}", frames=3, height=8, width=8) for i in range(5)]
+    data = Windows(clips, WindowSettings(frames=3, crop=8), repeats=3)
+    drawn = [data[n]["key"] for n in range(len(data))]
+    assert len(set(drawn)) == 15
+    assert len(data._opened) <= 2
+    assert len(data._draws) <= 2

@@ -218,8 +218,8 @@ def test_a_failure_keeps_its_row_and_reason(tiny_dataset, tmp_path):
     assert [row.failure for row in rows[:2]] == ["RuntimeError: no road leads there", None]
     summary.write(tmp_path / "t", comparison, methods, rows)
     text = (tmp_path / "t/evaluation.md").read_text()
-    assert "failed: test_0: RuntimeError: no road leads there" in text
-    assert "- broken, 3.25 PPP, 3 bit, test_1: RuntimeError" in text
+    assert "failed: test_0000: RuntimeError: no road leads there" in text
+    assert "- broken, 3.25 PPP, 3 bit, test_0001: RuntimeError" in text
     assert [row.method for row in finished((tmp_path / "t/rows.jsonl").read_text().splitlines())] == ["moment:1"] * 2
 
 

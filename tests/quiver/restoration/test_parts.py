@@ -155,7 +155,7 @@ def test_weights_are_restored_and_scored_by_the_commands(tiny_dataset, tmp_path,
     """The file names its network; the rows and the description of the video state it."""
     network = tiny("emvd")
     save(network, network.config, tmp_path / "mine.safetensors")
-    clip = tiny_dataset / "clips" / "test_0"
+    clip = tiny_dataset / "clips" / "test_0000"
     weights = str(tmp_path / "mine.safetensors")
     out = tmp_path / "out.npy"
     assert main(["restore", str(clip), "--ppp", "3.25", "--method", weights, "-o", str(out), "-q"]) == 0

@@ -235,7 +235,7 @@ class Poisoned(nn.Module):
 
 def test_nan_stops_with_step_samples_and_state(tiny_dataset, tmp_path):
     network = Poisoned()
-    with pytest.raises(Diverged, match=r"step 2: loss nan.*samples \[4, 5\] \(train_\d frame .*failed\.pt") as error:
+    with pytest.raises(Diverged, match=r"step 2: loss nan.*samples \[4, 5\] \(train_\d+ frame .*failed\.pt") as error:
         train(network, settings(tiny_dataset, tmp_path / "r"), progress=False)
     assert "\n" not in str(error.value)
     saved = torch.load(tmp_path / "r/failed.pt", weights_only=True)
@@ -312,7 +312,7 @@ def test_clips_that_train_do_not_validate(tiny_dataset, tmp_path):
         make_windows(settings(clip, tmp_path), 4)
     windows, fixed = make_windows(settings((tiny_dataset, clip), tmp_path), 4)
     assert len(windows.clips) == 4
-    assert [one.name for one in fixed.dataset.clips] == ["val_0", "val_1"]
+    assert [one.name for one in fixed.dataset.clips] == ["val_0000", "val_0001"]
     _, asked = make_windows(settings((tiny_dataset, clip), tmp_path, validation_split="train"), 4)
     assert len(asked.dataset.clips) == 4
 
@@ -321,7 +321,7 @@ def test_a_run_resumes_only_with_its_clips(tmp_path):
     """A clip that was made since would change every later sample; a data set without all its clips is named."""
     data = write_dataset(tmp_path / "d", {"train": 2, "val": 1})
     said = list[str]()
-    record = data / "jobs/train_1.json"
+    record = data / "jobs/train_0001.json"
     record.rename(tmp_path / "away.json")
     once = settings(data, tmp_path / "r", steps=1)
     train(small_network(), once, progress=False, note=said.append)
