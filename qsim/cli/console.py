@@ -23,6 +23,7 @@ from typing import Any
 
 from qsim.cli.command import STARTS_AGAIN, Command, Printing
 from qsim.cli.setting_options import record_of
+from qsim.cli.signals import ending
 from qsim.cli.usage import Program, UsageError
 from qsim.files import FULL, Progress, wording
 from qsim.process import peak_memory
@@ -80,14 +81,15 @@ def running() -> Running:
 
 
 def run(program: Program, argv: Sequence[str] | None) -> int:
-    """Read and run a command line; return its exit code. Wrong input becomes one line on stderr and 2, Ctrl-C 130.
+    """Read and run a command line; return its exit code. Wrong input becomes one line on stderr and 2, Ctrl-C 130,
+    as do termination (SIGTERM) and a terminal that closes (SIGHUP).
 
     With --json a failure is also an object on stdout: {"error": its line, "exit_code": 2}. Without words, print help.
     Streams that cannot be written do not end the work. A result that is lost on stdout changes exit code 0 to 1, but
     not if its reader has ended, as in `| head`.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    with tolerant_output() as (out, _):
+    with tolerant_output() as (out, _), ending():
         code = _run(program, words)
         out.flush()
         lost = out.failure
@@ -144,6 +146,10 @@ def _answered(program: Program, command: Command, values: Mapping[str, Any], sta
         return failed(
             f"{program.name}: {command.in_options(error, one_line(error), program.options)}", 2, state.printing.json
         )
+    except RuntimeError as error:
+        if not str(error).startswith("Symlink loop"):  # of pathlib, for a link that leads to itself
+            raise
+        return failed(f"{program.name}: {one_line(error)}; name the file itself", 2, state.printing.json)
     except KeyboardInterrupt:
         return failed(f"\n{program.name}: interrupted; {_then(state)}", 130, state.printing.json)
     finally:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from textwrap import shorten
@@ -75,9 +74,7 @@ PROGRAM = Program(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line and return the exit code."""
-    from quiver.cli.signals import handling
     from quiver.threads import wait_without_spinning
 
     wait_without_spinning()
-    with handling(signal.default_int_handler, signal.SIGTERM):  # termination cleans up as Ctrl-C does
-        return run(PROGRAM, argv)
+    return run(PROGRAM, argv)

@@ -16,11 +16,11 @@ from qsim.checks import ArgumentError
 from qsim.cli.command import command
 from qsim.cli.console import RESUMES, WITHOUT_FORCE, failed, note, output, running
 from qsim.cli.options import check_free
+from qsim.cli.signals import ENDING, handling
 from qsim.files import Blocked, Damaged
 from qsim.kinds import Split
 from qsim.settings import setting
 from quiver.cli.options import use_threads
-from quiver.cli.signals import handling
 from quiver.device import DEVICES
 from quiver.model.names import QUIVERS
 from quiver.restoration.interface import RestoreOptions
@@ -170,7 +170,7 @@ def network_of(settings: Settings, first: Path | None = None) -> Any:
 
 def _signals(found: list[int]) -> AbstractContextManager[None]:
     """Collect Ctrl-C and termination instead of ending: the loop ends after its step and saves its state."""
-    return handling(lambda number, _: found.append(number), signal.SIGINT, signal.SIGTERM)
+    return handling(lambda number, _: found.append(number), signal.SIGINT, *ENDING)
 
 
 def _summary(folder: Path, state: Any) -> tuple[dict[str, Any], str]:

@@ -68,7 +68,7 @@ def begin_worker(number: int) -> None:
 
     The process that trains ends after its step, saves, and stops its workers.
     """
-    for number_of_signal in (signal.SIGINT, signal.SIGTERM):
+    for number_of_signal in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number_of_signal, signal.SIG_IGN)
 
 

@@ -6,8 +6,8 @@ import signal
 
 import pytest
 
+from qsim.cli.signals import handling
 from quiver.cli.program import main
-from quiver.cli.signals import handling
 from quiver.evaluation.comparison import ComparisonRow
 from quiver.evaluation.metrics import Score
 from quiver.training import ablation

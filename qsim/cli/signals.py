@@ -8,6 +8,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
+ENDING = (signal.SIGTERM, signal.SIGHUP)  # what asks a program to end: a service manager, a terminal that closes
+
 
 @contextlib.contextmanager
 def handling(handler: Callable[[int, Any], Any], *numbers: signal.Signals) -> Iterator[None]:
@@ -19,3 +21,9 @@ def handling(handler: Callable[[int, Any], Any], *numbers: signal.Signals) -> It
     finally:
         for number, old in before.items():
             signal.signal(number, old)
+
+
+def ending() -> contextlib.AbstractContextManager[None]:
+    """Let termination and a closed terminal end the block as Ctrl-C does; a host's own handler, and nohup, stay."""
+    numbers = [number for number in ENDING if signal.getsignal(number) is signal.SIG_DFL]
+    return handling(signal.default_int_handler, *numbers)
