@@ -16,13 +16,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_safetensors
 from torch import Tensor, nn
 
+from qsim import limits, opening
 from qsim.files import write_bytes
 from qsim.thread_warnings import warnings_here
 from quiver.host import own_numbers
 from quiver.model.presets import NETWORKS, WithoutValues
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files
-MAX_CONFIG = 10_000  # characters of a configuration
 MAX_REASON = 300  # characters of an error of torch that are shown
 DAMAGE = (  # errors that torch raises for damaged files and other content
     *(RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError, OverflowError, MemoryError),
@@ -36,6 +36,7 @@ def read_torch(path: Path, device: torch.device | str = "cpu") -> Any:
     Nothing in the file is executed. A zip whose parts claim more bytes than the file has is refused before it is
     read, because torch does not compress.
     """
+    opening.regular(path, "checkpoint")
     try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
@@ -67,7 +68,7 @@ def save(network: nn.Module, config: Any, path: Path, notes: Mapping[str, str] |
         "config": json.dumps(config.to_dict()),
     }
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
-    write_bytes(path, to_safetensors(tensors, metadata))
+    write_bytes(path, _in_bytes(tensors, metadata))
 
 
 @own_numbers
@@ -81,7 +82,7 @@ def load(path: Path) -> nn.Module:
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path}: not weights of this program (no format {FORMAT!r}); see `quiver convert-weights`")
     try:
-        if len(metadata["config"]) > MAX_CONFIG:
+        if len(metadata["config"]) > limits.CONFIGURATION:
             raise ValueError(f"a configuration of {len(metadata['config'])} characters")
         values = json.loads(metadata["config"])
         with torch.device("meta"), WithoutValues():
@@ -121,7 +122,16 @@ def annotate(path: Path, notes: Mapping[str, str | None]) -> None:
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path}: not weights of this program (no format {FORMAT!r}); see `quiver convert-weights`")
     kept = {name: text for name, text in (metadata | dict(notes)).items() if text is not None}
-    write_bytes(path, to_safetensors(tensors, kept))
+    write_bytes(path, _in_bytes(tensors, kept))
+
+
+def _in_bytes(tensors: dict[str, Tensor], metadata: dict[str, str]) -> bytes:
+    """Return a safetensors file, equal for equal contents: the library orders notes differently in each process."""
+    content = to_safetensors(tensors, metadata)
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)  # tensors begin at a multiple of eight bytes
+    return len(header).to_bytes(8, "little") + header + content[end:]
 
 
 def _build(kind: str, values: dict[str, object]) -> nn.Module:
@@ -134,8 +144,7 @@ def _build(kind: str, values: dict[str, object]) -> nn.Module:
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Return tensors of any shape and metadata; FileNotFoundError or ValueError for any other file."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such weights file")
+    opening.regular(path, "weights file")
     try:
         with safe_open(path, framework="pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
