@@ -85,7 +85,10 @@ class Lock:
     def _create(self) -> None:
         """Make the lock file in one step, unless another process made it meanwhile."""
         with naming(self.path), Scratch(self.path) as scratch:
-            scratch.new().write_bytes(RECORD)
+            with open(scratch.new(), "xb") as file:
+                file.write(RECORD)
+                file.flush()
+                os.fsync(file.fileno())  # after a power cut an empty lock would be somebody else's
             try:
                 os.link(scratch.new(), self.path)
             except FileExistsError:

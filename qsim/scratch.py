@@ -5,15 +5,16 @@
     .qsim-TOKEN/0, 1          new files or folders, which are renamed to their output when they are complete
     .qsim-TOKEN/old           a folder that was replaced, until it is deleted
 
-TOKEN is 128 random bits and the folder is made exclusively, so no file or link of anybody lies under its names. Of a
-writer that was killed, `sweep` gives complete files their names and deletes the folder: only if its record states the
-folder's own token, its lock is free, this user owns it, and it holds nothing but these names. A writer that was killed
-before it wrote its record left an empty folder, or one with an empty record. Whatever else looks like it stays.
+TOKEN is 64 random bits and 64 bits of their SHA-256, and the folder is made exclusively, so no file or link of anybody
+lies under its names. Of a writer that was killed, `sweep` gives complete files their names and deletes the folder: only
+if its token is such a pair, its lock is free, this user owns it, and it holds nothing but these names. A power cut may
+have lost the record or its content; then nothing gets a name. Whatever else looks like it stays.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import re
@@ -23,6 +24,8 @@ import stat
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
+
+from qsim import limits
 
 try:
     import fcntl
@@ -35,7 +38,6 @@ OLD = "old"
 _NEW = re.compile(r"[0-9]{1,3}")
 _FOLDER = re.compile(r"\.qsim-([0-9a-f]{32})")
 _EXCLUSIVE = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
-_LARGEST_RECORD = 1 << 16  # bytes
 
 
 class Scratch:
@@ -52,7 +54,7 @@ class Scratch:
 
     def _made(self) -> bool:
         """Make the folder and its record, locked; return False if they were taken for those of a killed writer."""
-        token = secrets.token_hex(16)
+        token = _token()
         self.folder = self._parent / f"{PREFIX}{token}"
         os.mkdir(self.folder, 0o700)
         try:
@@ -96,10 +98,12 @@ class Scratch:
         so that a description which exists describes what is there.
         """
         moves = [(str(new.relative_to(self.folder)), output.name, _state(output)) for new, output in outputs]
-        if self._lock is not None:
+        if self._lock is not None and len(moves) > 1:  # one file is whole or absent without a record
             record = {"software": "qsim", "token": self.folder.name.removeprefix(PREFIX), "moves": moves}
             os.pwrite(self._lock, json.dumps(record).encode(), 0)
             os.fsync(self._lock)
+            _sync(self.folder)  # a power cut after the first rename leaves the record and the other files
+            _sync(self._parent)
         _finish(self.folder, [(new, name) for new, name, _ in moves])
 
     @property
@@ -114,6 +118,17 @@ class Scratch:
             _delete(self.folder)
         if self._lock is not None:
             os.close(self._lock)
+
+
+def _token() -> str:
+    """Return a new token."""
+    chance = secrets.token_hex(8)
+    return chance + _proof(chance)
+
+
+def _proof(chance: str) -> str:
+    """Return the second half of a token: no other program, and no person, makes it by chance."""
+    return hashlib.sha256(b"a scratch folder of qsim: " + chance.encode()).hexdigest()[:16]
 
 
 def sweep(folder: Path) -> None:
@@ -136,30 +151,29 @@ def _sweep(folder: Path) -> None:
     with contextlib.suppress(OSError):
         folder.rmdir()  # an empty one
         return
-    lock = os.open(folder / RECORD, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        lock = os.open(folder / RECORD, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:  # lost by a power cut: a writer that lives has one before it makes anything else
+        if _is_proven(folder):
+            _delete(folder)
+        return
     try:
         if not stat.S_ISREG(os.fstat(lock).st_mode):
             return
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # an error while its writer lives
-        record = os.read(lock, _LARGEST_RECORD)
-        if _is_proven(folder, record):
+        record = os.read(lock, limits.RECORD)
+        if _is_proven(folder):
             _finish(folder, _moves_of(folder, record))
             _delete(folder)
     finally:
         os.close(lock)
 
 
-def _is_proven(folder: Path, record: bytes) -> bool:
-    """Return whether a record names its folder, which holds only what a writer makes."""
-    names = os.listdir(folder)
-    if not record:
-        return names == [RECORD]
-    try:
-        found = json.loads(record)
-    except ValueError:
-        return False
-    ours = isinstance(found, dict) and f".qsim-{found.get('token')}" == folder.name
-    return ours and all(name in (RECORD, OLD) or _NEW.fullmatch(name) for name in names)
+def _is_proven(folder: Path) -> bool:
+    """Return whether a folder has the name of a writer's, and holds only what a writer makes."""
+    token = folder.name.removeprefix(PREFIX)
+    ours = token[16:] == _proof(token[:16])
+    return ours and all(name in (RECORD, OLD) or _NEW.fullmatch(name) for name in os.listdir(folder))
 
 
 def _state(output: Path) -> list[int]:
@@ -168,7 +182,7 @@ def _state(output: Path) -> list[int]:
         found = os.lstat(output)
     except FileNotFoundError:
         return []
-    return [found.st_ino, found.st_mtime_ns]
+    return [found.st_size, found.st_mtime_ns]
 
 
 def _moves_of(folder: Path, record: bytes) -> list[tuple[str, str]]:
@@ -176,7 +190,12 @@ def _moves_of(folder: Path, record: bytes) -> list[tuple[str, str]]:
 
     Empty if an output is another file than it was then: somebody else's.
     """
-    found = json.loads(record).get("moves", []) if record else []
+    try:
+        stated = json.loads(record)
+    except ValueError:  # a power cut lost its content
+        return []
+    ours = isinstance(stated, dict) and f"{PREFIX}{stated.get('token')}" == folder.name
+    found = stated.get("moves", []) if ours else []
     left = [(new, name, state) for new, name, state in found if (folder / new).is_file()]
     named = all(Path(name).name == name and ".." not in Path(new).parts for new, name, _ in left)
     same = all(_state(folder.parent / name) in ([], state) for _, name, state in left)
@@ -184,12 +203,25 @@ def _moves_of(folder: Path, record: bytes) -> list[tuple[str, str]]:
 
 
 def _finish(folder: Path, moves: Sequence[tuple[str, str]]) -> None:
-    """Name the files that have no name yet."""
+    """Name the files that have no name yet; after a power cut, too, a description that exists describes its file."""
     left = [(folder / new, folder.parent / name) for new, name in moves if (folder / new).is_file()]
     for _, output in left[1:]:
         output.unlink(missing_ok=True)
+    if len(left) > 1:
+        _sync(folder.parent)
     for new, output in left:
         os.replace(new, output)
+        if len(moves) > 1:
+            _sync(folder.parent)
+
+
+def _sync(folder: Path) -> None:
+    """Sync the names in a folder."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _delete(folder: Path) -> None:

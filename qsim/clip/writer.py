@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import descriptions, files, locks, records, scratch
+from qsim import descriptions, files, locks, opening, records, scratch
 from qsim.arrays import plain
 from qsim.clip import clamped_error, exr
 from qsim.clip.clamped_error import StatedError
@@ -84,7 +84,7 @@ class ClipWriter:
             if not begun.is_file():  # before anything is deleted: an interrupted clearing stays recognisable
                 files.write_bytes(begun, self._identity_before() or identity)
             self._complete = self._is_complete()
-            if begun.read_bytes() != identity:
+            if opening.content(begun) != identity:
                 left = self._finished()
                 done = left.shape[0] if left is not None and self._complete else len(_read_journal(self.part))
                 if done and not self.force:
@@ -290,6 +290,7 @@ class ClipWriter:
         check_replaced(self.path)
         for name in ("begun.json", "journal.jsonl", "lock"):
             (self.part / name).unlink(missing_ok=True)
+        files.sync_folder(self.part)  # after a power cut the clip holds none of them
         if self.path.exists():
             files.remove_folder(self.path)
         os.replace(self.part, self.path)
@@ -368,7 +369,7 @@ def _read_journal(part: Path) -> dict[int, FrameEntry]:
         return {}
     frames = {}
     kept = []
-    for line in path.read_bytes().split(b"\n"):
+    for line in opening.content(path).split(b"\n"):
         try:
             entry = records.convert(json.loads(line), FrameEntry, str(path))
         except ValueError:
