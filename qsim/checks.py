@@ -10,11 +10,10 @@ from typing import Any, get_args
 
 import numpy as np
 
-from qsim import kinds
+from qsim import kinds, limits
 
 ROW_ORDERS: tuple[str, ...] = get_args(kinds.RowOrder)
 SPLITS: tuple[str, ...] = get_args(kinds.Split)
-MAX_PIXELS = 1 << 26  # of one frame: 8192 x 8192
 
 
 class ArgumentError(ValueError):
@@ -64,12 +63,12 @@ def check_video(path: Path, shape: tuple[int, ...]) -> tuple[int, int, int]:
 
 
 def check_shape(path: Path, shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """Return (T, H, W) if there is at least one frame of 1 to MAX_PIXELS pixels, else raise `ValueError`."""
+    """Return (T, H, W) if there is at least one frame of 1 to limits.PIXELS pixels, else raise `ValueError`."""
     if len(shape) != 3:
         raise ValueError(f"{path}: expected frames [T, H, W], found an array of shape {list(shape)}")
     frames, height, width = (int(n) for n in shape)
     if frames < 1:
         raise ValueError(f"{path}: has no frames")
-    if not (0 < height * width <= MAX_PIXELS and height > 0):
-        raise ValueError(f"{path}: frames of {height} x {width} pixels; between 1 and {MAX_PIXELS} pixels are read")
+    if not (0 < height * width <= limits.PIXELS and height > 0):
+        raise ValueError(f"{path}: frames of {height} x {width} pixels; between 1 and {limits.PIXELS} pixels are read")
     return frames, height, width

@@ -24,6 +24,7 @@ from typing import IO, Any, BinaryIO
 
 import numpy as np
 
+from qsim import opening
 from qsim.parsing import parse_json, parse_toml
 from qsim.scratch import Scratch, is_scratch, sweep
 from qsim.thread_warnings import warnings_here
@@ -63,11 +64,11 @@ def _version() -> str:
 VERSION = _version()
 
 
-def sha256(source: bytes | memoryview | Path) -> str:
-    """Return the hexadecimal SHA-256 of bytes or of a file."""
+def sha256(source: bytes | memoryview | Path, most: int | None = None) -> str:
+    """Return the hexadecimal SHA-256 of bytes or of a file of at most `most` bytes; errors as of `opening.opened`."""
     if not isinstance(source, Path):
         return hashlib.sha256(source).hexdigest()
-    with open(source, "rb") as file:
+    with opening.opened(source, most=most) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -208,22 +209,24 @@ def write_json(path: Path, value: Any) -> str:
     return write_bytes(path, to_json(value))
 
 
-def differs(path: Path, expected: str | None) -> list[str]:
-    """Return one message if a file is missing or has another SHA-256; else an empty list."""
-    if not path.is_file():
+def differs(path: Path, expected: str | None, most: int | None = None, beside: Path | None = None) -> list[str]:
+    """Return one message if a file is missing or has another SHA-256; else an empty list.
+
+    A file of more than `most` bytes, or behind a link out of the folder `beside`, differs and is not read.
+    """
+    try:
+        with opening.opened(path, most=most, beside=beside) as file:
+            same = hashlib.file_digest(file, "sha256").hexdigest() == expected
+    except FileNotFoundError:
         return [f"{path}: missing"]
-    return [] if sha256(path) == expected else [f"{path}: contents changed (checksum differs)"]
+    except ValueError as error:
+        return [f"{path}: contents changed ({str(error).removeprefix(f'{path}: ')})"]
+    return [] if same else [f"{path}: contents changed (checksum differs)"]
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
     """Return the tables of a TOML file; `FileNotFoundError` names `what` is missing, `ValueError` names the line."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such {what}")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: not a text file; a {what} is TOML in UTF-8") from None
-    return parse_toml(path, text)
+    return parse_toml(path, opening.text(path, what))
 
 
 def _mode(path: Path) -> int | None:
@@ -235,14 +238,7 @@ def _mode(path: Path) -> int | None:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; `ValueError` as `parse_json`, also for what is no file, or no text."""
-    mode = _mode(path)
-    if mode is not None and not stat.S_ISREG(mode):  # a pipe would be waited for
-        raise ValueError(f"{path}: is a folder, a pipe or a device, not a file; move it away")
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not readable as JSON ({error}); the file is damaged, make it again") from None
-    return parse_json(path, text)
+    return parse_json(path, opening.text(path))
 
 
 def check_ours(folder: Path, names: str) -> None:
@@ -274,6 +270,7 @@ def remove_folder(folder: Path) -> None:
         )
     with Scratch(folder) as scratch:
         os.replace(folder, scratch.old)
+        sync_folder(folder.parent)  # after a power cut no half of it has its name
         shutil.rmtree(scratch.old)
 
 
@@ -299,16 +296,16 @@ def decoding_errors(path: Path, what: str) -> Iterator[None]:
         raise ValueError(f"{path}: not readable as {what} ({text or type(error).__name__})") from None
 
 
-def load_array(path: Path) -> np.ndarray:
-    """Return a .npy array of numbers as a memory map, or a .npy.gz in memory.
+def load_array(path: Path, beside: Path | None = None) -> np.ndarray:
+    """Return a .npy array of numbers as a memory map, or a .npy.gz in memory; `beside` as of `opening.opened`.
 
     `FileNotFoundError`, or `ValueError` for other files, objects, a number without axes, and wrong headers.
     """
     if path.suffix == ".gz":
-        with decoding_errors(path, "gzipped .npy"), gzip.open(path, "rb") as packed:
+        with decoding_errors(path, "gzipped .npy"), opening.opened(path) as file, gzip.open(file, "rb") as packed:
             return read_npy(path, packed)
     with decoding_errors(path, ".npy"):
-        with open(path, "rb") as file:
+        with opening.opened(path, beside=beside) as file:
             if file.read(2) == b"PK":
                 raise ValueError(f"{path}: is an archive (.npz) under another name; save the array alone with np.save")
         array = np.lib.format.open_memmap(path, mode="r")

@@ -8,16 +8,16 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-LARGEST = 1 << 64  # whole numbers in files stay below: seeds and keys have 64 bits
-DEEPEST = 64  # levels of nesting in a file
+from qsim.limits import BENEATH, WHOLE
+
 _TOO_LARGE = "a whole number of more than 64 bits"
-_TOO_DEEP = f"nested more than {DEEPEST} levels deep"
+_TOO_DEEP = f"nested more than {BENEATH} levels deep"
 
 
 def parse_toml(path: Path, text: str) -> dict[str, Any]:
     """Return the tables of a TOML text; `ValueError` as `FILE:LINE: ...` for bad TOML, deep nesting, huge numbers."""
     if re.search(
-        rf"(?<![\w\"'.-])(?:[\w\"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}", text
+        rf"(?<![\w\"'.-])(?:[\w\"'-]+[ \t]*\.[ \t]*){{{BENEATH}}}", text
     ):  # the parser takes quadratic time for these
         raise ValueError(f"{path}:{_line_of_depth(text)}: not valid TOML: {_TOO_DEEP}")
     try:
@@ -75,10 +75,10 @@ def _too_much(value: Any, text: str, infinite: bool = False) -> tuple[int, str] 
         item, depth = waiting.pop()
         for inner in item.values() if isinstance(item, dict) else item:
             if isinstance(inner, dict | list):
-                if depth == DEEPEST:
+                if depth == BENEATH:
                     return _line_of_depth(text), _TOO_DEEP
                 waiting.append((inner, depth + 1))
-            elif isinstance(inner, int) and abs(inner) >= LARGEST:
+            elif isinstance(inner, int) and abs(inner) >= WHOLE:
                 return _line_of_number(text), _TOO_LARGE
             elif isinstance(inner, float) and not infinite and abs(inner) == float("inf"):
                 return 1, "a number of more than 1e308"
@@ -90,11 +90,11 @@ def _line_of_depth(text: str) -> int:
     depth = 0
     for n, line in enumerate(text.splitlines(), 1):
         bare = re.sub(r'"(?:\\.|[^"\\])*"', "", line)
-        if len(re.findall(r"[\w\"'-]\s*\.", line)) >= DEEPEST:
+        if len(re.findall(r"[\w\"'-]\s*\.", line)) >= BENEATH:
             return n
         for sign in bare:
             depth += (sign in "[{") - (sign in "]}")
-            if depth > DEEPEST:
+            if depth > BENEATH:
                 return n
     return 1
 

@@ -18,6 +18,7 @@ from typing import Annotated
 
 import numpy as np
 
+from qsim import opening
 from qsim.cli.command import command
 from qsim.cli.console import OPTIONAL, RESUMES, failed, output, running
 from qsim.cli.options import check_free
@@ -74,7 +75,7 @@ def claim(out: Path) -> None:
     """Make the folder and mark it; `FileExistsError` if it holds files but not the mark: somebody else's."""
     mark = out / MARK
     ours = {"format": "qsim-demo-1"}
-    if mark.is_file() and not mark.is_symlink() and mark.read_bytes() == to_json(ours):
+    if mark.is_file() and not mark.is_symlink() and opening.content(mark) == to_json(ours):
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"{out}: exists and was not made by `qsim demo`; name another folder")

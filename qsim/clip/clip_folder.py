@@ -22,6 +22,7 @@ from typing import Any, Self
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import opening
 from qsim.checks import file_path
 from qsim.clip import exr
 from qsim.clip.clip_info import ClipInfo, frame_file
@@ -211,7 +212,7 @@ class ClipFolder:
             check_crop(crop, height, width, str(self.path))
         path = self.path / frame_file(folder, t)
         try:
-            return exr.read_half(path, height, width, crop, colour=self.bands is not None)
+            return exr.read_half(path, height, width, crop, colour=self.bands is not None, beside=self.path)
         except FileNotFoundError:
             raise FileNotFoundError(
                 f"{path}: no such file; the clip is damaged, run `qsim check {self.path}`"
@@ -237,6 +238,7 @@ class ClipFolder:
             why = f"the clip is damaged, run `qsim check {self.path}`" if kept else f"frame {t} has no ground truth"
             raise FileNotFoundError(f"{path}: no such file; {why}")
         status = path.stat()
+        opening.regular(path, beside=self.path)
         return _read_truth(path, *self.shape[1:], status.st_mtime_ns, status.st_size)
 
     def _check_frame(self, t: int) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import limits, opening
 from qsim.arrays import plain
 from qsim.files import decoding_errors, native
 from qsim.optics.radiometry import Crop
@@ -60,7 +61,9 @@ def above_half(image: Array) -> Array:
     return found if found.ndim == 2 else np.asarray(found.any(axis=0))
 
 
-def read_half(path: Path, height: int, width: int, crop: Crop | None = None, *, colour: bool = False) -> Array:
+def read_half(
+    path: Path, height: int, width: int, crop: Crop | None = None, *, colour: bool = False, beside: Path | None = None
+) -> Array:
     """Return float32 [h, w] of an uncompressed half image of channel Y; only rows of the crop (y, x, h, w) are read.
 
     With `colour` the channels are R, G, B and the result is [3, h, w].
@@ -72,8 +75,8 @@ def read_half(path: Path, height: int, width: int, crop: Crop | None = None, *, 
     channels = 3 if colour else 1
     start = len(header) + 8 * height
     stride = 8 + 2 * width * channels
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
+    with opening.opened(path, beside=beside) as file:
+        descriptor = file.fileno()
         size = os.fstat(descriptor).st_size
         if size != start + stride * height or os.pread(descriptor, len(header), 0) != header:
             raise ValueError(
@@ -81,8 +84,6 @@ def read_half(path: Path, height: int, width: int, crop: Crop | None = None, *, 
                 f"({start + stride * height} bytes); the file is truncated or damaged, run `qsim check`"
             )
         raw = os.pread(descriptor, rows * stride, start + y * stride)
-    finally:
-        os.close(descriptor)
     table = np.frombuffer(raw, dtype=np.uint8).reshape(rows, stride)
     if int.from_bytes(raw[:4], "little") != y:
         raise ValueError(f"{path}: row {y} is not at its place; the file is damaged, run `qsim check`")
@@ -91,7 +92,12 @@ def read_half(path: Path, height: int, width: int, crop: Crop | None = None, *, 
     return np.stack(planes) if colour else planes[0]
 
 
-def read(path: Path, size: tuple[int, int] | None = None) -> dict[str, Array]:
+def largest(height: int, width: int) -> int:
+    """Return the most bytes that a frame's file has: 16 channels of 4 bytes, none of them shrunk, and headers."""
+    return 65536 + height * (64 + 64 * width)
+
+
+def read(path: Path, size: tuple[int, int] | None = None, beside: Path | None = None) -> dict[str, Array]:
     """Return the channels [H, W] of a scan-line EXR file by name; `size` = (height, width), if it is known.
 
     The OpenEXR library decodes. `ValueError` if the file is unreadable, has another size, or declares more pixels than
@@ -99,8 +105,7 @@ def read(path: Path, size: tuple[int, int] | None = None) -> dict[str, Array]:
     """
     import OpenEXR
 
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; the clip is damaged, run `qsim check`")
+    opening.regular(path, "file; the clip is damaged, run `qsim check`", beside=beside)
     with decoding_errors(path, "OpenEXR; the file is damaged, run `qsim check`"):
         with OpenEXR.File(native(path), separate_channels=True, header_only=True) as file:
             header = dict(file.header())  # a copy: closing empties it
@@ -110,7 +115,7 @@ def read(path: Path, size: tuple[int, int] | None = None) -> dict[str, Array]:
         height, width = size or found
         if found != [height, width] or header["type"] != OpenEXR.scanlineimage:
             raise ValueError(f"{path}: holds {header['type']} {found}, expected scan lines {[height, width]}")
-        if 2 * height * width * len(names) > 1032 * path.stat().st_size:  # the most that deflate can shrink
+        if 2 * height * width * len(names) > limits.DEFLATED * path.stat().st_size:
             raise ValueError(f"{path}: {path.stat().st_size} bytes cannot hold {len(names)} channels of {found}")
         with OpenEXR.File(native(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from qsim import descriptions, files, scratch
+from qsim import descriptions, files, opening, scratch
 from qsim.clip.manifest import read_info
 from qsim.dataset.checking import repair_jobs
 from qsim.dataset.dataset import Damaged, Dataset, DatasetInfo, Part, checked_part
@@ -216,9 +216,9 @@ class FramesDone:
             self._frames += job.settings.frames
             self._begun.pop(number, None)
             return
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, ValueError):
             journal = self.folder / "work" / f"{job.key}.part" / "journal.jsonl"
-            self._begun[number] = journal.read_bytes().count(b"\n")
+            self._begun[number] = opening.content(journal).count(b"\n")
 
 
 def write_manifest(recipe: Recipe, folder: Path) -> None:

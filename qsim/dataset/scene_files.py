@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from qsim import files, scenes
+from qsim import files, limits, opening, scenes
 from qsim.dataset.provenance import nested
 from qsim.scene import Scene
 
@@ -37,7 +37,6 @@ _LEFT_OUT = tuple(f"{os.path.realpath(folder)}{os.sep}" for folder in (*_INSTALL
 _LIBRARY = Path(scenes.__file__).resolve().parent
 # of one Mitsuba scene
 MOST_FOLDERS = 100
-MOST_FILES = 10_000
 _PARTS_LEFT_OUT = frozenset({".cache", "site-packages", "dist-packages", "__pycache__"})
 
 
@@ -80,7 +79,7 @@ def _declared(path: Path) -> dict[Path, set[Path]]:
 def _reads(path: Path) -> list[str]:
     """Return the list `reads` of a Python file as it is written, without running it; empty if it has none."""
     try:
-        body = ast.parse(path.read_bytes()).body
+        body = ast.parse(opening.content(path)).body
     except (SyntaxError, OSError, ValueError):
         return []  # the loader reports the error
     found = [node for node in body if _binds_reads(node)]
@@ -151,8 +150,8 @@ def _follow(path: Path, folders: list[Path], defaults: dict[str, str], found: se
     if path in found:
         return
     found.add(path)
-    if len(found) > MOST_FILES:
-        raise ValueError(f"{path}: a scene that names more than {MOST_FILES} files")
+    if len(found) > limits.SCENE_FILES:
+        raise ValueError(f"{path}: a scene that names more than {limits.SCENE_FILES} files")
     elements = _elements(path)
     if _plain(path.parent) not in folders:
         folders.append(_plain(path.parent))
@@ -215,7 +214,7 @@ def _imported(path: Path, found: set[Path] | None = None) -> set[Path]:
         return found
     found.add(path)
     with contextlib.suppress(SyntaxError, OSError, ValueError):
-        for node in ast.walk(ast.parse(path.read_bytes())):
+        for node in ast.walk(ast.parse(opening.content(path))):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
             if isinstance(node, ast.ImportFrom):
                 names = [node.module or "", *(f"{node.module}.{name}" for name in names)]

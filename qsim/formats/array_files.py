@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files
+from qsim import files, limits, opening
 from qsim.checks import check_shape
 from qsim.clip.source import Source
 from qsim.colour import luminance, to_linear
@@ -36,8 +36,6 @@ from qsim.formats.recording import (
 )
 from qsim.sensor import packing
 
-_LARGEST_CHUNK = 1 << 29  # bytes of a zarr chunk in memory; one of quanta-spad-sim has up to 200 MB
-_LARGEST_METADATA = 1 << 22  # bytes
 _ZARR_METADATA = ("zarr.json", ".zarray", ".zattrs", ".zgroup", ".zmetadata")
 # Of zarr; others execute what a file holds (pickle), or expand a few bytes without a limit (bz2, lzma).
 _CODECS = {
@@ -184,10 +182,8 @@ def read_zarr(path: Path, hints: Hints) -> Recording:
         if array.dtype.kind not in "bu":
             raise ValueError(f"{path}: expected unsigned codes, found {array.dtype}")
         stored = getattr(array, "shards", None) or array.chunks
-        if float(np.prod(stored, dtype=float)) * array.dtype.itemsize > _LARGEST_CHUNK:
-            raise ValueError(
-                f"{path}: chunks of {list(stored)} pixels; up to {_LARGEST_CHUNK} bytes are read at a time"
-            )
+        if float(np.prod(stored, dtype=float)) * array.dtype.itemsize > limits.CHUNK:
+            raise ValueError(f"{path}: chunks of {list(stored)} pixels; up to {limits.CHUNK} bytes are read at a time")
         wanted = math.prod(-(-n // chunk) for n, chunk in zip(shape, stored, strict=True))
         found = _count_files(folder, wanted)  # before the library lists all the chunks that there should be
         if found >= wanted:
@@ -212,12 +208,12 @@ def _zarr_codecs(path: Path, folder: Path) -> set[str]:
         raise ValueError(f"{path}: is a single file; a zarr is read from its folder, so unpack it first")
     described = [folder / name for name in ("zarr.json", ".zarray") if (folder / name).is_file()]
     for file in [*described, *(path / name for name in ("zarr.json", ".zattrs", ".zgroup")), folder / ".zattrs"]:
-        if file.is_file() and file.stat().st_size > _LARGEST_METADATA:
-            raise ValueError(f"{file}: {file.stat().st_size} bytes of metadata; up to {_LARGEST_METADATA} are read")
+        if file.is_file():
+            opening.regular(file, "description", most=limits.METADATA, beside=path)
     found: set[str] = set()
     for file in described:
         with decoding_errors(file, "JSON"):
-            content = json.loads(file.read_text("utf-8"))
+            content = json.loads(opening.text(file))
             waiting = [content[key] for key in ("codecs", "filters", "compressor") if key in content]
             while waiting:
                 item = waiting.pop()
@@ -226,7 +222,7 @@ def _zarr_codecs(path: Path, folder: Path) -> set[str]:
                     waiting += item.values()
                 elif isinstance(item, list):
                     waiting += item
-    if not any((folder / ".zarray" == file) or b'"array"' in file.read_bytes() for file in described):
+    if not any((folder / ".zarray" == file) or b'"array"' in opening.content(file) for file in described):
         inside = sorted(item.name for item in itertools.islice(path.iterdir(), 100) if item.is_dir())
         raise ValueError(f"{path}: a zarr group without the array 'frames'; it holds {inside}")
     return {name.removeprefix("numcodecs.") for name in found}
@@ -248,7 +244,7 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     if not description.is_file():
         raise FileNotFoundError(f"{path}: has no transforms.json; a recording of visionsim is a folder with one")
     with decoding_errors(description, "JSON"):
-        info = json.loads(description.read_text("utf-8"))
+        info = json.loads(opening.text(description))
         width = int(info["w"])
         packed = bool(info.get("bitpack", "bitpack_dim" in info or info.get("bitplanes", 1) == 1))
         planes = None if info.get("bitplanes") is None else int(info["bitplanes"])

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files
+from qsim import files, opening
 from qsim.checks import check_shape
 from qsim.colour import from_linear
 from qsim.files import decoding_errors, load_array
@@ -180,7 +180,7 @@ def read_picture(path: Path, size: tuple[int, int]) -> Array:
     """Return a colour picture of 8 bits, uint8 [H, W, 3]; `ValueError` if it is damaged or of another size."""
     from PIL import Image
 
-    with decoding_errors(path, "PNG"), Image.open(path, formats=["PNG"]) as opened:
+    with decoding_errors(path, "PNG"), opening.opened(path) as file, Image.open(file, formats=["PNG"]) as opened:
         if (opened.height, opened.width) != size or opened.mode != "RGB":
             raise ValueError(
                 f"{path}: {opened.mode} of {opened.height} x {opened.width} pixels; its cube needs RGB of "

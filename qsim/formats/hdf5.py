@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import limits, opening
 from qsim.files import decoding_errors
 from qsim.formats.array_files import Values, codes_of, light_of
 from qsim.formats.recording import Hints, Recording
 
 LISTED = 20  # datasets that a message names
-LARGEST_CHUNK = 1 << 29  # bytes in memory
-RATIO = 1032.0  # most by which deflate can compress
 
 
 def read_hdf5(path: Path, hints: Hints) -> Recording:
@@ -26,18 +25,17 @@ def read_hdf5(path: Path, hints: Hints) -> Recording:
     """
     import h5py
 
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+    opening.regular(path)
     with decoding_errors(path, "HDF5"), h5py.File(path, "r") as file:
         name = hints.dataset.strip("/") if hints.dataset is not None else _only(path, _datasets(file))
         stored = _dataset(path, file, name)
         shape = tuple(stored.shape)
         dtype = stored.dtype
         promised = math.prod(shape) * dtype.itemsize
-        if promised > RATIO * path.stat().st_size:
+        if promised > limits.DEFLATED * path.stat().st_size:
             raise ValueError(f"{path}: {name} states {promised:.3g} bytes, which {path.stat().st_size} cannot hold")
-        if stored.chunks is not None and math.prod(stored.chunks) * dtype.itemsize > LARGEST_CHUNK:
-            raise ValueError(f"{path}: {name} is stored in chunks above {LARGEST_CHUNK} bytes, too large to read")
+        if stored.chunks is not None and math.prod(stored.chunks) * dtype.itemsize > limits.CHUNK:
+            raise ValueError(f"{path}: {name} is stored in chunks above {limits.CHUNK} bytes, too large to read")
 
     def read(index: tuple[Any, ...]) -> Array:
         with decoding_errors(path, "HDF5"), h5py.File(path, "r") as opened:

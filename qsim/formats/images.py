@@ -6,6 +6,7 @@ pixel, or stretched to 0 ... 255). Colour becomes linear luminance (Rec. 709). M
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files
+from qsim import files, limits, opening
 from qsim.checks import check_shape
 from qsim.clip import exr
 from qsim.clip.source import Source
@@ -220,10 +221,13 @@ def _png(path: Path, codes: bool) -> Page:
     """Return a PNG in the values that it stores; a palette as its codes, or (not `codes`) in its colours."""
     from PIL import Image
 
-    with decoding_errors(path, "PNG"), Image.open(path, formats=["PNG"]) as opened:
+    with (
+        decoding_errors(path, "PNG"),
+        opening.opened(path, most=limits.ASSET) as file,
+        Image.open(file, formats=["PNG"]) as opened,
+    ):
         check_shape(path, (1, opened.height, opened.width))
-        with open(path, "rb") as file:
-            header = file.read(26)
+        header = os.pread(file.fileno(), 26, 0)
         # IHDR: bits per sample; 0 grey, 2 RGB, 3 palette, 4 and 6 with alpha
         depth = header[24]
         kind = header[25]
@@ -270,7 +274,7 @@ ORIENTATION_TAG = 274  # of TIFF and EXIF
 def _tiff(path: Path, page: int, hints: Hints) -> Page:
     import tifffile
 
-    with decoding_errors(path, "TIFF"), tifffile.TiffFile(path) as opened:
+    with decoding_errors(path, "TIFF"), tifffile.TiffFile(opening.regular(path)) as opened:
         found: Any = opened.pages[page]
         check_shape(path, (1, found.imagelength, found.imagewidth))
         kind = found.photometric

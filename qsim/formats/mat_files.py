@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import limits, opening
 from qsim.checks import check_shape
 from qsim.clip.source import Source
 from qsim.file_order import numbered
@@ -26,7 +27,7 @@ def read_mat(path: Path, hints: Hints) -> Recording:
         info = path / "info.json"
         if info.is_file():
             with decoding_errors(info, "JSON"):
-                wanted = int(json.loads(info.read_text("utf-8"))["no_parts"])
+                wanted = int(json.loads(opening.text(info))["no_parts"])
             if len(files) > wanted:
                 raise ValueError(f"{path}: {len(files)} parts, and info.json states {wanted}; move the others away")
             files = [path / f"part_{k}.mat" for k in range(1, min(wanted, 100_000) + 1)]
@@ -54,9 +55,7 @@ def mat_array(path: Path, variable: str | None = None) -> Array:
 
     It is `variable`; without a name OUTPUT, or the only array of numbers in two (one frame) or three dimensions.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    with open(path, "rb") as file:
+    with opening.opened(path) as file:
         head = file.read(1024)
     if b"\x89HDF\r\n\x1a\n" in head:
         return _hdf_array(path, variable)
@@ -123,8 +122,8 @@ def _frames_first(path: Path, name: str, planes: Array) -> Array:
 
 
 def _plausible(path: Path, shape: tuple[int, ...]) -> None:
-    """Raise `ValueError` if a header states more values than deflate (at most 1032-fold) can hold in the file."""
+    """Raise `ValueError` if a header states more values than deflate can hold in the file."""
     promised = float(np.prod(shape, dtype=float))
     size = path.stat().st_size
-    if promised > 1032.0 * size:
+    if promised > limits.DEFLATED * size:
         raise ValueError(f"{path}: the header states {promised:.3g} values, which {size} bytes cannot hold")

@@ -14,6 +14,7 @@ would have seen.
 from __future__ import annotations
 
 import json
+import math
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files
+from qsim import files, limits, opening
 from qsim.checks import check_shape
 from qsim.clip.source import Source
 from qsim.files import decoding_errors
@@ -115,6 +116,11 @@ class PhotonTimes:
 
     def _histogram(self, frame: Array, pixel: Array, frames: int) -> Array:
         _, height, width = self.shape
+        if frames * height * width > limits.COUNTS:
+            raise ValueError(
+                f"{frames} exposures or planes of {height} x {width} pixels are more counts than the {limits.COUNTS} "
+                "that are held in memory; take fewer"
+            )
         found = np.bincount(frame * (height * width) + pixel, minlength=frames * height * width)
         return found.reshape(frames, height, width)
 
@@ -168,6 +174,8 @@ def read_photons(path: Path, hints: Hints) -> Recording:
     if not 1 <= bits <= 8:
         raise ValueError(f"{path}: sums of planes of {bits} bits; 1 to 8 are made of photon times")
     planes = 2**bits - 1
+    if planes * math.prod(photons.shape) > limits.COUNTS:
+        raise ValueError(f"{path}: states {planes} planes of {list(photons.shape)}, too many to read at once")
     fired = photons.clocked(planes).reshape(-1, planes, *photons.shape[1:])
     codes = fired.sum(axis=1, dtype=np.uint8)
     rate = photons.frame_rate
@@ -181,7 +189,7 @@ def read_photons(path: Path, hints: Hints) -> Recording:
 
 def _arrays(path: Path) -> dict[str, Array]:
     """Return the arrays of the file; `ValueError` unless each has its type, one axis, and the bytes that it states."""
-    with open(path, "rb") as opened, zipfile.ZipFile(opened) as archive:
+    with opening.opened(path) as opened, zipfile.ZipFile(opened) as archive:
         sizes = {item.filename: item.file_size for item in archive.infolist()}
         if set(sizes) != {f"{name}.npy" for name in _ARRAYS} or any(
             item.compress_type != zipfile.ZIP_STORED for item in archive.infolist()

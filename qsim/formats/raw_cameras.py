@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files
+from qsim import files, opening
 from qsim.checks import check_shape
 from qsim.clip.source import Source
 from qsim.formats.raw_layout import raw_files
@@ -85,7 +85,8 @@ def read_spike(path: Path, hints: Hints) -> Recording:
         if isinstance(shape, list) and len(shape) == 3 and all(type(n) is int for n in shape):
             _, height, width = shape
     if height is None and width is None and config.is_file():
-        found = dict(re.findall(r"^\s*(spike_h|spike_w)\s*:\s*(\d{1,9})\b", config.read_text("utf-8", "replace"), re.M))
+        settings = opening.content(config, "description").decode("utf-8", "replace")
+        found = dict(re.findall(r"^\s*(spike_h|spike_w)\s*:\s*(\d{1,9})\b", settings, re.M))
         height = int(found.get("spike_h", 0)) or None
         width = int(found.get("spike_w", 0)) or None
     if height is None or width is None:
@@ -133,6 +134,8 @@ def _roughness(planes: Array) -> float:
 def _raw(
     files: list[Path], counts: list[int], frame_bytes: int, size: tuple[int, int], decode: Any, source: Source
 ) -> Recording:
+    for file in files:
+        opening.regular(file)
     ends = np.cumsum(counts)
 
     def read(start: int, stop: int) -> Array:

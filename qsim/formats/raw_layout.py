@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import limits, opening
 from qsim.checks import check_shape
 from qsim.clip.source import Source
 from qsim.file_order import numbered
@@ -26,8 +27,6 @@ from qsim.formats import gaps
 from qsim.formats.recording import ENDIANS, ORDERS, Hints, Recording, check_size, values_recording
 from qsim.kinds import Bits
 from qsim.records import convert
-
-LARGEST_SIDE_FILE = 1 << 20  # bytes of a .cihx
 
 
 @dataclass(frozen=True)
@@ -223,9 +222,7 @@ _PHOTRON_MAY = (
 
 def _photron_facts(path: Path) -> dict[str, str]:
     """Return the facts of a .cihx (an element <cih> among other bytes) or a .cih (lines `Name : value`)."""
-    if path.stat().st_size > LARGEST_SIDE_FILE:
-        raise ValueError(f"{path}: {path.stat().st_size} bytes; a description has up to {LARGEST_SIDE_FILE}")
-    text = path.read_bytes().decode("utf-8", "ignore")
+    text = opening.content(path, "description", most=limits.SIDE_FILE).decode("utf-8", "ignore")
     if path.suffix.lower() == ".cih":
         lines = dict(re.findall(r"^\s*([^:\n]+?)\s*:[ \t]*(.*?)\s*$", text, re.MULTILINE))
         found = {name: lines.get(key) for name, _, key in _PHOTRON}
@@ -315,6 +312,7 @@ def _recording(path: Path, files: list[Path], layout: Layout, form: str, hints: 
     what = f"{form} ({layout.said})"
     counts = []
     for file in files:
+        opening.regular(file)
         size = file.stat().st_size - layout.skip
         if size < 0:
             raise ValueError(f"{file}: {file.stat().st_size} bytes, fewer than the {layout.skip} to skip")

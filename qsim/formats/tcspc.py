@@ -13,20 +13,18 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import limits, opening
 from qsim.checks import check_shape
 from qsim.files import decoding_errors
 from qsim.formats.array_files import Values, codes_of
 from qsim.formats.recording import Hints, Recording
-
-MOST_COUNTS = 1 << 29  # of an image, which is held in memory
 
 
 def read_ptu(path: Path, hints: Hints) -> Recording:
     """Read the image of a PTU file in T3 mode: counts [T, Y, X] of one channel; its frame time gives the rate."""
     import ptufile
 
-    _need(path)
-    with decoding_errors(path, "PTU"), open(path, "rb") as opened, ptufile.PtuFile(opened) as file:
+    with decoding_errors(path, "PTU"), opening.opened(path) as opened, ptufile.PtuFile(opened) as file:
         if not (file.is_t3 and file.is_image):
             kind = getattr(file.measurement_submode, "name", file.measurement_submode)
             raise ValueError(f"{path}: holds a {kind} measurement; images in T3 mode are read")
@@ -49,8 +47,7 @@ def read_sdt(path: Path, hints: Hints) -> Recording:
     """Read the images of an SDT file: counts [Y, X] of each data block, which are channels or (--axes TYX) frames."""
     import sdtfile
 
-    _need(path)
-    with decoding_errors(path, "SDT"), open(path, "rb") as opened, sdtfile.SdtFile(opened) as file:
+    with decoding_errors(path, "SDT"), opening.opened(path) as opened, sdtfile.SdtFile(opened) as file:
         blocks = [np.asarray(block) for block in file.data]
     images = [block.sum(axis=-1, dtype=np.uint32) for block in blocks if block.ndim in (3, 4)]
     if not images:
@@ -75,14 +72,9 @@ def _counts(path: Path, counts: Array, axes: str, source: str, hints: Hints) -> 
     return replace(found, code_model="counting", reading=said)
 
 
-def _need(path: Path) -> None:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-
-
 def _check_size(path: Path, size: list[Any]) -> None:
     """Raise `ValueError` for an image that is empty, or too large to hold."""
     frames, height, width, channels = (int(n) for n in size)
     check_shape(path, (frames, height, width))
-    if frames * height * width * channels > MOST_COUNTS:
+    if frames * height * width * channels > limits.COUNTS:
         raise ValueError(f"{path}: states {frames} frames of {height} x {width} pixels, too many to read at once")

@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.checks import MAX_PIXELS
+from qsim import limits, opening
 from qsim.files import decoding_errors
 from qsim.formats import axes
 from qsim.formats.recording import Hints
-
-RATIO = 1032  # most by which deflate can compress
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,7 @@ def frames_of(path: Path, hints: Hints) -> Stack:
     """
     import tifffile
 
-    with decoding_errors(path, "TIFF"), tifffile.TiffFile(path) as opened:
+    with decoding_errors(path, "TIFF"), tifffile.TiffFile(opening.regular(path)) as opened:
         count = len(opened.pages)  # the library refuses a chain of pages in a circle
         own = not (opened.is_ome or opened.is_micromanager)  # these name further files, which are not opened
         if opened.is_shaped or (opened.is_imagej and own):
@@ -74,9 +72,9 @@ def check_size_of(path: Path, page: int, found: Any) -> None:
     there = path.stat().st_size
     row_bits = found.imagewidth * found.samplesperpixel * found.bitspersample
     promised = -(-row_bits // 8) * found.imagelength  # rows begin at a byte
-    if promised > RATIO * there or (found.compression == 1 and promised > there):
+    if promised > limits.DEFLATED * there or (found.compression == 1 and promised > there):
         raise ValueError(f"{path}: page {page} states {promised} bytes, the file has {there}")
-    if float(np.prod(found.chunks, dtype=float)) > max(MAX_PIXELS, 4 * found.imagelength * found.imagewidth):
+    if float(np.prod(found.chunks, dtype=float)) > max(limits.PIXELS, 4 * found.imagelength * found.imagewidth):
         raise ValueError(f"{path}: page {page} is stored in tiles of {list(found.chunks)} pixels, too large to read")
 
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files
-from qsim.checks import MAX_PIXELS, check_shape
+from qsim import files, limits, opening
+from qsim.checks import check_shape
 from qsim.clip.source import Source
 from qsim.files import decoding_errors
 from qsim.formats.images import to_luminance
@@ -165,12 +165,13 @@ def _full(path: Path, pixels: Any) -> int:
 
 
 def _open_video(path: Path) -> Any:
-    """Open a container; files that name other files (playlists) and frames above MAX_PIXELS are refused."""
+    """Open a container; files that name other files (playlists) and frames above limits.PIXELS are refused."""
     import av
 
+    opening.regular(path)
     container = av.open(files.native(path), options={"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"})
     for stream in container.streams.video:
-        stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+        stream.codec_context.options = {"max_pixels": str(limits.PIXELS)}
     return container
 
 

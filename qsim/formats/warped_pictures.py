@@ -24,7 +24,7 @@ from msgspec import Meta
 from numpy import ndarray as Array
 from scipy import ndimage
 
-from qsim import files
+from qsim import files, limits, opening
 from qsim.clip.clip_info import ClipInfo
 from qsim.clip.source import Source
 from qsim.clip.writer import ClipWriter
@@ -264,7 +264,7 @@ def make(asked: WarpedPictures) -> int:
     lights = read_pictures(paths, max(size))
     if not licence.is_file():
         raise FileNotFoundError(f"{licence}: no such file; name the file that states the licence of the pictures")
-    digests = [f"texture {files.sha256(path)}" for path in paths]
+    digests = [f"texture {files.sha256(path, limits.ASSET)}" for path in paths]
     missing = {n: path for n, path in asked.places.items() if not path.exists()}
     for n, path in asked.places.items():
         if n not in missing:
@@ -299,8 +299,8 @@ def _check_same(path: Path, wanted: ClipInfo) -> None:
 
 def _copy_licence(licence: Path, folder: Path) -> None:
     """Copy a licence as LICENCE.txt; another one that is there stays, and this one is named by its checksum."""
-    text = licence.read_bytes()
+    text = opening.content(licence)
     copy = folder / "LICENCE.txt"
-    if copy.is_file() and copy.read_bytes() != text:
+    if copy.is_file() and opening.content(copy) != text:
         copy = folder / f"LICENCE-{files.sha256(text)[:8]}.txt"
     files.write_bytes(copy, text)

@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from qsim import files
+from qsim import files, limits
 from qsim.checks import file_path, suggest
 from qsim.device_lock import one_thread_at_a_time
 from qsim.host import own_numbers
@@ -96,7 +96,7 @@ def read_mitsuba(
         _check_flicker(path, name, flicker, loaded, parameters)
     parts = tuple(Part(name, motions.get(name)) for name in names)
     camera = camera or _camera(mi, loaded, path)
-    file = MitsubaFile(str(path), files.sha256(path), dict(flickers) if flickers else None)
+    file = MitsubaFile(str(path), files.sha256(path, limits.TEXT), dict(flickers) if flickers else None)
     return Scene(path.stem, 0, camera, (), (), file=file, parts=parts, bands=None if bands is None else RGB)
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from qsim import records
-from qsim.checks import MAX_PIXELS
+from qsim import limits, records
 from qsim.kinds import FrameRate, Frames, Psnr, Shutter, Text
 from qsim.settings import setting
 
@@ -50,8 +49,8 @@ class RenderSettings:
     def __post_init__(self) -> None:
         records.settle(self)
         height, width = self.size
-        if height * width > MAX_PIXELS:
-            raise ValueError(f"frames of {height} x {width} pixels; at most {MAX_PIXELS} pixels are rendered")
+        if height * width > limits.PIXELS:
+            raise ValueError(f"frames of {height} x {width} pixels; at most {limits.PIXELS} pixels are rendered")
 
     @property
     def size(self) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qsim import files
+from qsim import files, opening
 from qsim.report import html as page
 
 if TYPE_CHECKING:
@@ -244,7 +244,7 @@ def study_section(path: Path) -> page.Section:
     lines = [f"{_heading(key)}: {page.number_text(value)}" for key, value in words.items()]
     picture = path.with_name("best.png" if "cells" in found else f"{path.stem}.png")  # of a sweep, or of one study
     name = f"{path.parent.name}/{picture.name}"
-    figure = page.stored_figure(picture.read_bytes(), name) if picture.is_file() else None
+    figure = page.stored_figure(opening.content(picture), name) if picture.is_file() else None
     story = next((str(text) for text in (found.get("answer"), *found.get("answers", [])) if text), "")
     return page.section(f"Study: {path.parent.name}", page.bullets(lines), figure, table, story=story)
 
@@ -256,7 +256,8 @@ def bench_section(path: Path) -> page.Section:
     rows = [[cost.get(key) for key in keys] for cost in found["costs"]]
     setting = ", ".join(f"{key} {value}" for key, value in found["setting"].items() if value is not None)
     picture = path.with_name("bench.png")
-    figure = page.stored_figure(picture.read_bytes(), "seconds per frame against PSNR") if picture.is_file() else None
+    title = "seconds per frame against PSNR"
+    figure = page.stored_figure(opening.content(picture), title) if picture.is_file() else None
     table = page.table(page.Table(setting, [_heading(key) for key in keys], rows))
     return page.section(f"Cost of a frame: {path.parent.name}", figure, table)
 

@@ -22,8 +22,7 @@ import numpy as np
 from msgspec import Meta
 from numpy import ndarray as Array
 
-from qsim import files
-from qsim.checks import MAX_PIXELS
+from qsim import files, limits
 from qsim.file_order import natural
 from qsim.kinds import Number, Positive
 from qsim.optics.camera import Camera
@@ -44,7 +43,7 @@ TERMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 ZERO = ("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew")  # terms of lenses that are not modelled
 OTHER_LENSES = ("is_fisheye", "latlong", "equirectangular", "orthographic")  # flags of other projections
 
-Pixels = Annotated[float, Meta(ge=1, le=MAX_PIXELS, multiple_of=1)]  # programs also write 800.0
+Pixels = Annotated[float, Meta(ge=1, le=limits.PIXELS, multiple_of=1)]  # programs also write 800.0
 Angle = Annotated[float, Meta(ge=1e-6, le=3.14)]  # of view, rad
 
 

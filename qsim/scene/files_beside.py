@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import io
-import stat
 from pathlib import Path
 
+from qsim import limits, opening
 from qsim.scene.image_files import decoded
 from qsim.scene.materials import Picture
 
-LARGEST = 1 << 31  # bytes of a file that is read
-
 
 def regular_bytes(path: Path, where: str) -> bytes:
-    """Return the bytes of a regular file of at most LARGEST bytes; a pipe or device is refused before it is read."""
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode):
-        raise ValueError(f"{where}: {path} is no regular file")
-    if status.st_size > LARGEST:
-        raise ValueError(f"{where}: {path} has {status.st_size} bytes; at most {LARGEST} are read")
-    return path.read_bytes()
+    """Return the bytes of a regular file that a document names; errors as of `opening.content`."""
+    try:
+        return opening.content(path, most=limits.ASSET)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def file_beside(document: Path, where: str, name: str, folder: Path | None = None) -> Path:

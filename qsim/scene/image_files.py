@@ -10,6 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import limits, opening
 from qsim.colour import luminance, to_linear
 from qsim.files import native
 
@@ -26,12 +27,19 @@ def read_colour(path: Path) -> np.ndarray:
 
 def _linear(path: Path) -> np.ndarray:
     """Return linear colours [H, W, 3], upright; grey counts with all its 16 bits, colours with the upper 8."""
-    if not path.is_file():
-        raise FileNotFoundError(f"texture {path}: no such file")
-    return decoded(path, f"texture {path}")
+    with _asset(path, "texture") as file:
+        return decoded(file, f"texture {path}")
 
 
-def decoded(source: Path | BinaryIO, where: str, *, turned: bool = True) -> np.ndarray:
+def _asset(path: Path, role: str) -> BinaryIO:
+    """Return an open file that a scene names; errors begin with its role."""
+    try:
+        return opening.opened(path, most=limits.ASSET)
+    except (FileNotFoundError, ValueError) as error:
+        raise type(error)(f"{role} {error}") from None
+
+
+def decoded(source: BinaryIO, where: str, *, turned: bool = True) -> np.ndarray:
     """Return linear colours, float32 [H, W, 3], of an open image file; `ValueError` starts with `where`.
 
     `turned` applies its orientation tag.
@@ -58,8 +66,7 @@ def decoded(source: Path | BinaryIO, where: str, *, turned: bool = True) -> np.n
 
 def read_hdr(path: Path) -> Array:
     """Return the linear picture [H, W] or [H, W, 3] of an .exr (OpenEXR) or .hdr (Radiance) file."""
-    if not path.is_file():
-        raise FileNotFoundError(f"environment {path}: no such file")
+    _asset(path, "environment").close()
     if path.suffix.lower() == ".hdr":
         return _read_radiance(path)
     import OpenEXR
@@ -81,7 +88,7 @@ def _read_radiance(path: Path) -> Array:
 
     Pixels are divided by the exposures of the header, which programs have multiplied into them.
     """
-    content = path.read_bytes()
+    content = opening.content(path, most=limits.ASSET)
     lines = re.match(rb"(#\?.*?)\r?\n\r?\n([^\n]*)\n", content, re.DOTALL)
     head, size = (b"", b"") if lines is None else (lines[1].replace(b"\r\n", b"\n"), lines[2])
     body = b"" if lines is None else content[lines.end() :]

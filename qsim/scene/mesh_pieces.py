@@ -16,12 +16,12 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from qsim import limits
 from qsim.scene.bands import Colour
 from qsim.scene.materials import Diffuse, Patches, Picture, Texture
 from qsim.scene.scene import Mesh
 
 Array = NDArray[np.float64]
-MOST_TEXELS = 1 << 27  # of the pictures of all materials of a file
 OUTSIDE = 1e-6  # by which coordinates on a clamped axis may leave 0 .. 1
 
 
@@ -75,9 +75,9 @@ def material_of(pieces: Sequence[Piece]) -> Diffuse | Patches | None:
         texture = _texture(paint, [piece.uv for piece in alike if piece.uv is not None])
         assert isinstance(texture.image, Picture)
         shown[id(texture.image.colours)] = texture.image.colours.size // 3
-        if sum(shown.values()) > MOST_TEXELS:
+        if sum(shown.values()) > limits.TEXELS:
             raise ValueError(
-                f"{paint.where}: the pictures of the file have over {MOST_TEXELS} pixels in all; export smaller ones"
+                f"{paint.where}: the pictures of the file have over {limits.TEXELS} pixels in all; export smaller ones"
             )
         materials.append(Diffuse(texture))
         counts.append(sum(len(piece.faces) for piece in alike))

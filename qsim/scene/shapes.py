@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qsim import limits, opening
 from qsim.scene.animated.gltf_body import GLTF_SUFFIXES, still_pieces
 from qsim.scene.materials import Material
 from qsim.scene.mesh_pieces import Piece, material_of, mesh_of
@@ -248,11 +249,14 @@ def mesh_material(path: str | Path) -> Material | None:
 
 def _pieces(path: Path) -> list[Piece] | None:
     """Return the parts of a file with their coordinates and colours; None for a file that can have none."""
-    if not path.is_file():
-        raise FileNotFoundError(f"mesh {path}: no such file")
+    try:
+        opening.regular(path, most=limits.ASSET)
+    except (FileNotFoundError, ValueError) as error:
+        raise type(error)(f"mesh {error}") from None
     if path.suffix.lower() in GLTF_SUFFIXES:
         return still_pieces(path)
-    if path.suffix.lower() == ".obj" and re.search(rb"(?m)^(\xef\xbb\xbf)?\s*(vt|mtllib)\s", path.read_bytes()):
+    has_more = re.compile(rb"(?m)^(\xef\xbb\xbf)?\s*(vt|mtllib)\s")
+    if path.suffix.lower() == ".obj" and has_more.search(opening.content(path, most=limits.ASSET)):
         return obj_pieces(path)
     return None
 

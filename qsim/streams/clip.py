@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 
 from qsim import colour as pictures
 from qsim import files
+from qsim.clip import exr
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.clip_info import RELATIVE
 from qsim.clip.film import Film, card
@@ -109,7 +110,7 @@ class Clip(ClipFolder):
         report = progress or (lambda done, total: None)
         total = len(stored) + len(streams)
         for done, (relative, expected) in enumerate(stored, 1):
-            problems += files.differs(self.path / relative, expected)
+            problems += files.differs(self.path / relative, expected, exr.largest(*self.shape[1:]), self.path)
             report(done, total)
         for done, path in enumerate(streams, len(stored) + 1):
             try:

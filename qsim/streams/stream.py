@@ -274,7 +274,7 @@ class Stream:
         expected = (frames, height, packing.packed_width(width, self.bits))
         if not self.path.is_file():
             raise FileNotFoundError(f"{self.path}: no such file, but its json exists; sense it again and replace it")
-        array = files.load_array(self.path)
+        array = files.load_array(self.path, self.path.parent)
         if array.shape != expected or array.dtype != np.uint8:
             raise ValueError(
                 f"{self.path}: expected uint8 {list(expected)}, found {array.dtype} {list(array.shape)}; "
@@ -296,9 +296,16 @@ class Stream:
         part = np.asarray(self.packed[start:stop, y : y + h, low:high])
         return packing.unpack(part, self.bits, x + w - first)[..., x - first :]
 
+    @property
+    def _bytes(self) -> int:
+        """Bytes of the packed array with its header."""
+        frames, height, width = self.shape
+        row = packing.packed_width(width, self.bits)
+        return len(_header(frames, height, row)) + frames * height * row
+
     def verify(self, progress: Progress | None = None) -> list[str]:
         """Return one message per file whose checksum differs; empty if the stream is intact."""
-        problems = files.differs(self.path, self.info.sha256)
+        problems = files.differs(self.path, self.info.sha256, self._bytes, self.path.parent)
         try:
             if problems:
                 self._written()

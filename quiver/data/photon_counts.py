@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import limits, opening
 from qsim.arrays import plain
 from qsim.checks import ArgumentError
 from qsim.files import decoding_errors, load_array, read_npy
@@ -17,8 +18,6 @@ from qsim.streams.sensing import Sensing
 from quiver.data.codes import codes_of, open_stream, summed
 from quiver.data.illumination import Illumination, ideal_clocked
 from quiver.data.photon_cubes import cube_codes
-
-LARGEST = 1 << 32  # bytes of an array of counts in a .npz
 
 
 @dataclass(frozen=True)
@@ -102,12 +101,14 @@ def _load(path: Path) -> Array:
     """Return the one array of a .npy or .npz."""
     if path.suffix == ".npy":
         return load_array(path)
-    with zipfile.ZipFile(path) as archive:
+    with opening.opened(path) as opened, zipfile.ZipFile(opened) as archive:
         members = archive.infolist()
         if len(members) != 1:
             names = ", ".join(member.filename.removesuffix(".npy") for member in members[:3])
             raise ValueError(f"holds {len(members)} arrays ({names}); one is read")
-        if members[0].file_size > LARGEST:
-            raise ValueError(f"its array has {members[0].file_size:,} bytes, and {LARGEST:,} are read at most")
+        if members[0].file_size > limits.COUNT_BYTES:
+            raise ValueError(
+                f"its array has {members[0].file_size:,} bytes, and {limits.COUNT_BYTES:,} are read at most"
+            )
         with archive.open(members[0]) as member:
             return read_npy(path, member)

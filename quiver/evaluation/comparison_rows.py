@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from qsim import opening
 from quiver.evaluation import metrics
 from quiver.evaluation.json_values import json_safe, number
 from quiver.restoration.interface import RestoreOptions
@@ -69,7 +70,7 @@ def stored_rows(path: Path) -> list[ComparisonRow]:
     """Return the finished rows of a file, none without it; the incomplete last line of a killed writer is ended."""
     if not path.exists():
         return []
-    text = path.read_text()
+    text = opening.text(path)
     if not text.endswith("\n"):
         with open(path, "a", encoding="utf-8") as file:
             file.write("\n")

@@ -16,6 +16,7 @@ from typing import Annotated, Any, NotRequired, TypedDict
 import numpy as np
 from msgspec import Meta
 
+from qsim import limits
 from qsim.kinds import Count, Number
 from qsim.records import convert
 from qsim.scene.animated.gltf_buffers import Document, entries_of, open_document
@@ -45,7 +46,6 @@ POINTS = 0
 TRIANGLES = 4
 STRIP = 5
 FAN = 6
-MOST_VERTICES = 5_000_000  # of all pieces of a file
 
 Attributes = dict[Annotated[str, Meta(pattern=r"^\w+$")], Count]  # of what -> accessor
 
@@ -158,8 +158,8 @@ def _read(
             continue
         for piece in _pieces(document, i, nodes, tracks, joints, number, paints):
             pieces.append(piece)
-            if sum(len(each.vertices) for each in pieces) > MOST_VERTICES:  # a small file can name one array often
-                raise ValueError(f"{document.path}: its meshes have more than {MOST_VERTICES} vertices in all")
+            if sum(len(each.vertices) for each in pieces) > limits.VERTICES:  # a small file can name one array often
+                raise ValueError(f"{document.path}: its meshes have more than {limits.VERTICES} vertices in all")
     if not pieces:
         raise ValueError(f"{document.path}: its scene has no mesh")
     return by_paint(pieces), joints

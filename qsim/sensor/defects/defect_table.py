@@ -35,7 +35,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
-from qsim import files
+from qsim import files, limits
 from qsim.kinds import Digest, NotNegative
 from qsim.records import convert
 from qsim.sensor.defects.fixed_pattern import FixedPattern
@@ -113,7 +113,9 @@ class Defects:
         pattern = {key: getattr(self.pattern, key) for key in _PATTERN if getattr(self.pattern, key)}
         if self.pattern.dark is not None:
             pattern["dark"] = asdict(self.pattern.dark)
-        maps = {key: {"file": path, "sha256": files.sha256(Path(path))} for key, path in self.maps.items()}
+        maps = {
+            key: {"file": path, "sha256": files.sha256(Path(path), limits.ASSET)} for key, path in self.maps.items()
+        }
         own = {key: getattr(self, key) for key in (*_DISTURBANCES, "carry_dead_time") if getattr(self, key)}
         return pattern | maps | own
 
@@ -163,6 +165,6 @@ def _map_file(value: Any, key: str, where: str) -> str:
         raise ValueError(f"{where}: {key} must be the name of a .npy file, got {value!r}")
     if not Path(path).is_file():
         raise FileNotFoundError(f"{where}: {key}: {path}: no such file")
-    if digest is not None and files.sha256(Path(path)) != digest:
+    if digest is not None and files.sha256(Path(path), limits.ASSET) != digest:
         raise ValueError(f"{where}: {key}: {path} has changed since the stream was drawn")
     return path

@@ -326,7 +326,7 @@ def test_a_body_that_bends_has_its_colours_and_the_truth_of_all_its_patches(tmp_
 
 
 def test_a_small_file_that_shows_one_picture_often_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("qsim.scene.mesh_pieces.MOST_TEXELS", 100)
+    monkeypatch.setattr("qsim.limits.TEXELS", 100)
     file = gltf()
     primitive = file.content["meshes"][0]["primitives"][0]
     file.content["meshes"][0]["primitives"] = [primitive | {"material": i} for i in range(20)]

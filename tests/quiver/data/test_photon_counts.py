@@ -42,7 +42,7 @@ def test_counts_in_any_order_and_kind_of_file_are_the_same(tmp_path, monkeypatch
         np.savez_compressed(tmp_path / "a.npz", array)
         for path in (tmp_path / "a.npy", tmp_path / "a.npz"):
             np.testing.assert_array_equal(read_counts(path).frames, counts.reshape(6, 5, 4))
-    monkeypatch.setattr("quiver.data.photon_counts.LARGEST", 200)
+    monkeypatch.setattr("qsim.limits.COUNT_BYTES", 200)
     with pytest.raises(ValueError, match=r"a.npz: .*its array has 368 bytes, and 200 are read at most"):
         read_counts(tmp_path / "a.npz")
 

@@ -531,7 +531,7 @@ def test_a_required_extension_is_refused_by_name(tmp_path, reader, name):
 
 
 def test_a_small_file_that_names_one_array_often_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("qsim.scene.animated.gltf_body.MOST_VERTICES", 1000)
+    monkeypatch.setattr("qsim.limits.VERTICES", 1000)
     document = arm()
     for mesh in document.content["meshes"]:
         mesh["primitives"] = mesh["primitives"] * 500
