@@ -14,7 +14,7 @@ from qsim.backend import BACKENDS
 from qsim.cli.command import Idle, command
 from qsim.cli.completion import families
 from qsim.cli.console import PILOT, RESUMES, bar, output
-from qsim.kinds import Positive, Seed, Speed
+from qsim.kinds import Frames, Positive, Seed, Speed
 from qsim.rendering.render_settings import RenderSettings
 from qsim.settings import setting
 
@@ -38,9 +38,13 @@ class Render:
     ppp: Annotated[
         Positive | None,
         setting(
-            "highest light level you will sense, photons per pixel; sets samples so that the Monte-Carlo variance "
-            "stays below 1 % of the shot variance"
+            "highest light level you will sense, photons per pixel and code; sets samples so that the Monte-Carlo "
+            "variance stays below 1 % of the shot variance"
         ),
+    ] = None
+    planes: Annotated[
+        Frames | None,
+        setting("frames that a code will sum as binary planes: together they have the samples of a frame", unset="1"),
     ] = None
     engine: Annotated[str | None, setting("engine to use", unset="QSIM_ENGINE, else the fastest", choices=BACKENDS)] = (
         None
@@ -75,6 +79,7 @@ def render(asked: Render, settings: RenderSettings) -> int:
     if asked.engine is not None:
         os.environ["QSIM_ENGINE"] = asked.engine
         backend.choose()
+    planes = asked.planes or 1
     taken = {"seed": asked.seed, "ppp": asked.ppp} | {
         name: getattr(settings, name) for name in ("frames", "frame_rate", "shutter", "psnr", "reuse")
     }
@@ -83,11 +88,14 @@ def render(asked: Render, settings: RenderSettings) -> int:
     }
     if asked.output is None:
         scene, _ = scene_rendering.load_scene(asked.scene, **size, seed=asked.seed, frame_rate=settings.frame_rate)
-        chosen = choose_budget(scene, **taken)
+        light = None if asked.ppp is None else asked.ppp / planes
+        chosen = choose_budget(scene, **taken | {"ppp": light}, planes=planes, codes=(planes,))
         output({"render": dataclasses.asdict(chosen)}, explain(chosen.findings))
         return 0
     with bar(asked.output.name, first=PILOT) as progress:
-        clip = scene_rendering.render(asked.scene, asked.output, **taken, **size, progress=progress, force=asked.force)
+        clip = scene_rendering.render(
+            asked.scene, asked.output, **taken, **size, planes=planes, progress=progress, force=asked.force
+        )
     info = clip.info
     work = info.render
     assert work is not None

@@ -41,6 +41,7 @@ def render(  # noqa: PLR0913 (settings of a public function)
     shutter: float = RenderSettings.shutter,
     psnr: float = RenderSettings.psnr,
     ppp: float | None = None,
+    planes: int = 1,
     bands: Literal["rgb"] | None = None,
     camera_path: str | os.PathLike[str] | None = None,
     reuse: bool | None = None,
@@ -54,12 +55,12 @@ def render(  # noqa: PLR0913 (settings of a public function)
     .glb or .gltf, Mitsuba .xml, or a folder of assets. `height` and `width` [px] default to the camera of a `Scene` and
     to 128 of all others. `seed` is that of the scene and of its samples; `speed` is a factor on all motions (default
     1). `frame_rate` is in frames per second, `shutter` the open fraction of a frame, 0 for sharp frames. `psnr` [dB] is
-    the requested error, `ppp` the brightest light that will be sensed [photons/pixel] (`choose_budget`); a `budget`
-    decides both instead. `bands="rgb"` gives a scene of one band colours (scenes/colours.py) and renders red, green and
-    blue. `camera_path` is a transforms.json whose view, distortion and poses replace those of the scene's camera; a
-    file that states no rate has one pose per frame (qsim/scene/camera_path.py). `reuse` True lets sharp frames share
-    samples with their neighbours where that is predicted to cost less, None only where a trial costs little against the
-    clip, False never.
+    the requested error, `ppp` the brightest light that will be sensed [photons per pixel and code] (`choose_budget`); a
+    `budget` decides both instead. Of frames that codes will sum as `planes`, a code has that error. `bands="rgb"` gives
+    a scene of one band colours (scenes/colours.py) and renders red, green and blue. `camera_path` is a transforms.json
+    whose view, distortion and poses replace those of the scene's camera; a file that states no rate has one pose per
+    frame (qsim/scene/camera_path.py). `reuse` True lets sharp frames share samples with their neighbours where that is
+    predicted to cost less, None only where a trial costs little against the clip, False never.
 
     `path` is the folder of the clip; an equal call resumes an interrupted one. Without it, the clip lies in a temporary
     folder that is deleted after the last use of the clip and its streams. `progress(done, frames)` is called after each
@@ -69,6 +70,8 @@ def render(  # noqa: PLR0913 (settings of a public function)
     """
     if path is None and force:
         raise ValueError("force= replaces the clip of a folder, and no path is given; leave it out")
+    if budget is not None and planes != 1:
+        raise ValueError("planes= is part of the choice of a budget, and budget= replaces it; give one of them")
     if budget is not None and reuse is not None:
         raise ValueError("reuse= is part of the choice of a budget, and budget= replaces it; give one of them")
     RenderSettings(frames=frames, frame_rate=frame_rate, shutter=shutter, psnr=psnr, reuse=reuse)  # checks them
@@ -77,7 +80,16 @@ def render(  # noqa: PLR0913 (settings of a public function)
     loaded, read = load_scene(scene, height, width, seed, speed, bands, camera_path, frame_rate)
     if budget is None:
         budget = choose_budget(
-            loaded, frame_rate=frame_rate, shutter=shutter, frames=frames, psnr=psnr, ppp=ppp, reuse=reuse, seed=seed
+            loaded,
+            frame_rate=frame_rate,
+            shutter=shutter,
+            frames=frames,
+            psnr=psnr,
+            ppp=None if ppp is None else ppp / planes,
+            planes=planes,
+            codes=(planes,),
+            reuse=reuse,
+            seed=seed,
         )
     temporary = TemporaryFolder() if path is None else None
     name = loaded.name if NAME.fullmatch(loaded.name) else "scene"

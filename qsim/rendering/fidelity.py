@@ -41,6 +41,7 @@ DEEPEST = 32  # bounces of the reference for them
 MOST_SAMPLES = 16384
 PEAK_INSTANTS = 25  # whose mean gives the white of a blurred frame
 MOST_INSTANTS = 3 + 6 * 85
+BIAS = 0.01  # of the light, by which the noise of planes may lower the counts of binary planes
 PLANES = "planes"  # the finding about frames that share noise
 MOST_TRIED = 15  # instants up to which a larger number is rendered for comparison
 
@@ -213,12 +214,24 @@ def _planes(pilot: Pilot, sharp: Budget, work: _Work, denoise: bool | None) -> B
         if fewer is not None:
             chosen = Sharing(fewer[0], 0, fewer[1])
             how = f"their mean denoised, {fewer[1]} quality; {raw} without"
+    each = (chosen.samples - sharp.samples) // (count - 1)
+    unbiased = each
+    while planes_bias(work, unbiased, sharp.samples) > BIAS and unbiased < sharp.samples:
+        unbiased = 2 * plane_grid(unbiased // 2 + 1)
+    if unbiased > each:
+        how += f"; {each} would lower the counts of binary planes by more than {100 * BIAS:g} %"
+        each = unbiased
+        chosen = replace(chosen, samples=each * (count - 1) + sharp.samples)
     pixels = pilot.renderer.scene.camera.height * pilot.renderer.scene.camera.width
     alone = Sharing.of(sharp).cost(pixels)
     if chosen.cost(pixels) + alone - sharp.samples >= count * alone:
         return None
-    each = (chosen.samples - sharp.samples) // (count - 1)
     size = f"{each} samples per pixel each, {how}; that in the middle has {sharp.samples}"
+    if math.isfinite(work.allowed.sensor):
+        bias = planes_bias(work, each, sharp.samples)
+        size += f"; their noise lowers the counts of binary planes by {100 * bias:.2g} % of the light"
+    else:
+        size += "; without a light level, how far their noise lowers the counts of binary planes is not bounded"
     budget = replace(
         sharp,
         samples=each,
@@ -229,6 +242,17 @@ def _planes(pilot: Pilot, sharp: Budget, work: _Work, denoise: bool | None) -> B
         sharp_quality=sharp.quality if sharp.denoise else "",
     )
     return _with_finding(budget, Finding(PLANES, f"{count} share the noise of a code", size))
+
+
+def planes_bias(work: _Work, each: int, in_middle: int) -> float:
+    """Return by which share of the light the noise of planes lowers the counts of a code of binary planes.
+
+    A plane fires with 1 - exp(-photons): noise of s photons lowers its mean as s^2 / 2 photons less light would, to
+    second order. Over a code that is half of the planes' variance over the shot variance, of which `allowed.sensor` is
+    SENSOR_SHARE. A denoised mean leaves the noise of planes against each other. 0 without a light level.
+    """
+    raw = _of_code(work.noise, work.instants, each, in_middle).plain
+    return (raw / work.allowed.sensor) ** 2 * SENSOR_SHARE / 2
 
 
 def _with_finding(budget: Budget, finding: Finding) -> Budget:

@@ -13,10 +13,10 @@ from stats import critical_z
 
 from qsim.clip.clamped_error import StatedError, rms, stated
 from qsim.rendering import planes
-from qsim.rendering.budget import Budget, deciding
+from qsim.rendering.budget import Allowed, Budget, deciding
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.denoiser import available
-from qsim.rendering.fidelity import choose_budget, planes_together
+from qsim.rendering.fidelity import SENSOR_SHARE, Noise, _Work, choose_budget, planes_bias, planes_together
 from qsim.rendering.planes import most_planes, together
 from qsim.rendering.renderer import Renderer
 from qsim.scene import Constant, PulseWidth, Spin, SunSky
@@ -204,3 +204,32 @@ def test_the_larger_of_two_errors_and_their_sum_hold_at_every_white():
     assert one.and_more(4.0).plain == 5.0
     assert one.at(1.0) == 2.0
     assert one.at(9.0) == 3.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_bias_of_binary_planes_by_their_noise_is_half_of_the_variance_that_the_budget_allows(seed):
+    """Counts of noisy planes of random light and numbers, drawn by NumPy: as `planes_bias` states, to second order."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(2, 12))
+    light = float(rng.uniform(0.2, 2.0))  # photons per code
+    error = float(rng.uniform(0.1, 0.3))  # of a plane, over its light
+    allowed = Allowed(1.0, 1.0, math.sqrt(SENSOR_SHARE / light))
+    noise = Noise((error,) * 3, (error,) * 3)  # alike at any number of samples
+    stated_bias = planes_bias(_Work(2, count, 9, 1.0, allowed, noise), 4, 4)
+    noisy = light / count * (1 + error * rng.choice([-1.0, 1.0], (100_000, count)))
+    lost = (-np.expm1(-light / count) - (-np.expm1(-noisy)).mean()) * count * math.exp(light / count)
+    sampled = 4 * light / math.sqrt(count * 100_000) * error  # of the noise itself, whose mean is not quite 0
+    assert abs(lost / light - stated_bias) < 0.1 * stated_bias + sampled / light
+
+
+def test_a_budget_states_the_bias_of_its_planes_and_bounds_it(monkeypatch):
+    asked = {"psnr": 25.0, "denoise": False, "frames": 6, "frame_rate": 14000.0, "codes": (3,)}
+    for ppp, words in ((None, "is not bounded"), (2.0, "of the light")):
+        budget = choose_budget(SPINNING, **asked, ppp=ppp)
+        (shown,) = [finding.size for finding in budget.findings if finding.effect == "planes"]
+        assert f"{words}" in shown
+        assert "lowers the counts of binary planes" in shown
+    monkeypatch.setattr("qsim.rendering.fidelity.BIAS", 2e-3)
+    strict = choose_budget(SPINNING, **asked, ppp=2.0)
+    assert any("would lower the counts of binary planes by more than 0.2 %" in one.size for one in strict.findings)
+    assert strict.samples > budget.samples
