@@ -47,14 +47,14 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     """Return the draw of a clip as `prepare`, with given defects. A given sensor `own` has no file and no filters."""
     filters = _fitting_filters(clip, sensing, own is not None)
     own = None if own is None else as_summed(own, sensing)
-    planes = own.levels - 1 if own is not None and sensing.group else sensing.frames
-    if sensing.group and sensing.depth is None:
+    planes = own.levels - 1 if own is not None and sensing.summed else sensing.frames
+    if sensing.summed and sensing.depth is None:
         raise ValueError(f"{clip.name}: group= sums planes, and needs the bits of a code, as in bits=3")
     if not 1 <= planes <= len(clip):
-        what = f"one code of {planes} planes" if sensing.group else f"one exposure of {planes} slices"
+        what = f"one code of {planes} planes" if sensing.summed else f"one exposure of {planes} slices"
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
     if sensing.rows is not None:
-        _check_rows(sensing, clip, 1 if sensing.group else planes)
+        _check_rows(sensing, clip, 1 if sensing.summed else planes)
     ppp = None if sensing.ppp is None else sensing.ppp / planes
     level = light_level(clip, ppp=ppp, lux=sensing.lux, pixel_pitch=sensing.pixel_pitch)
     conditions = Conditions(sensing.temperature, _wavelength(clip), None if found is None else found.pattern.dark)
@@ -69,7 +69,7 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
     if sensing.exposures is not None:
         _check_exposures(sensing, sensor, found)
-    timing = sensing.timing(planes, sensing.group)
+    timing = sensing.timing(planes, sensing.summed)
     draw = Draw(sensor, level, key, timing, sensing.diffraction, found, colour=filters)
     return dataclasses.replace(draw, origin=clip.origin)
 
@@ -125,7 +125,7 @@ def _check_planes(sensor: Sensor, sensing: Sensing, clip: ClipFolder) -> None:
     kind = type(sensor).__name__
     if sensing.follow and not sensor.follows_photons:
         raise ValueError(f"{sensing.sensor_name}: follow= is for the photons of a CountingSPAD, this is a {kind}")
-    if sensing.group and not sensor.sums_planes:
+    if sensing.summed and not sensor.sums_planes:
         raise ValueError(f"{sensing.sensor_name}: group= is for a clocked SPAD (BinarySPAD), this is a {kind}")
     if sensing.slices > 1 and not sensor.takes_slices:
         raise ValueError(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from qsim import files, records
+from qsim.checks import ArgumentError
 from qsim.files import check_name
 from qsim.kinds import Bits, Frames, Light, Name, Number, Positive, Rise, RowOrder, Schedule, Seed, Text
 from qsim.plane_sums import Summed
@@ -125,14 +126,20 @@ class Sensing:
         if self.ppp is not None and self.lux is not None:
             raise ValueError("give the light level as ppp or as lux, not both")
         if self.planes is not None:
-            object.__setattr__(self, "group", True)
+            if self.group:
+                raise ArgumentError("group", f"sums 2^bits - 1 planes, planes={self.planes} sums others; leave it out")
             if self.bits not in (None, self.planes.bit_length()):
                 depth = self.planes.bit_length()
                 raise ValueError(f"planes={self.planes}: their sum has {depth} bits, not {self.bits}; leave bits= out")
-        if self.group and self.slices != 1:
+        if self.summed and self.slices != 1:
             raise ValueError("group sums planes, slices are of one exposure; give one of them")
         if self.row_order is not None and self.row_delay is None:
             raise ValueError(f"row_order {self.row_order}: orders rows that have their own time; give row_delay too")
+
+    @property
+    def summed(self) -> bool:
+        """Whether clip frames are planes that a code sums."""
+        return self.group or self.planes is not None
 
     @property
     def rows(self) -> Rows | None:
@@ -175,7 +182,7 @@ class Sensing:
     @property
     def frames(self) -> int:
         """The clip frames in a code: planes that are summed, or slices of an exposure."""
-        if not self.group:
+        if not self.summed:
             return self.slices
         if self.planes is not None:
             return self.planes
@@ -192,7 +199,7 @@ class Sensing:
             return self.planes.bit_length()
         if isinstance(self.sensor, Sensor):
             return self.sensor.bits
-        return devices.load(self.sensor, ppp=1.0).bits if self.group and self.sensor.endswith(".toml") else None
+        return devices.load(self.sensor, ppp=1.0).bits if self.summed and self.sensor.endswith(".toml") else None
 
 
 def sensor_of(sensing: Sensing, *, ppp: float | None, exposure: float, conditions: Conditions) -> Sensor:

@@ -105,7 +105,8 @@ class StreamInfo:
 
 def stored_settings(sensing: Sensing) -> dict[str, Any]:
     """Return the settings that a description holds: those at their default, or with an outcome in it, are left out."""
-    return {name: value for name, value in given(sensing).items() if name not in _ELSEWHERE}
+    found = {name: value for name, value in given(sensing).items() if name not in _ELSEWHERE}
+    return found | ({"group": True} if sensing.summed else {})
 
 
 def _table(value: Any) -> dict[str, Any]:

@@ -138,14 +138,14 @@ class Illumination:
     @property
     def planes(self) -> int:
         """Clip frames of a code."""
-        if self.sensing.group and self.record is not None:
+        if self.sensing.summed and self.record is not None:
             return self.device(5e-4).levels - 1
         return self.sensing.frames
 
     @property
     def timing(self) -> Timing:
         """When codes collect light."""
-        return self.sensing.timing(self.planes, self.sensing.group)
+        return self.sensing.timing(self.planes, self.sensing.summed)
 
     def over(self, planes: int | None, bits: int | None = None) -> Illumination:
         """Return the same with codes over so many clip frames; None: as it is.
@@ -160,11 +160,10 @@ class Illumination:
             return self.but(bits=depth).over(planes, bits)
         if planes == 1 or not self.device(5e-4).sums_planes:
             return self.but(group=False, slices=planes)
-        fixed = bits if self.record is None else self.bits
-        if fixed not in (None, depth):
+        if bits not in (None, depth):
             raise ArgumentError(
                 "planes",
-                f"a sum of {planes} planes has {depth} bits, and {fixed} are asked for; give planes= or bits= alone",
+                f"a sum of {planes} planes has {depth} bits, and {bits} are asked for; give planes= or bits= alone",
             )
         made = self.but(group=True, slices=1, bits=depth)
         if planes == 2**depth - 1 and self.record is None and not self._states_bits:
@@ -195,7 +194,7 @@ class Illumination:
 
         Where those are planes of a sum, one for each plane of this sensor's bits.
         """
-        if other.sensing.group and self.device(5e-4).sums_planes:
+        if other.sensing.summed and self.device(5e-4).sums_planes:
             return self.but(group=True)
         return self.over(other.planes)
 
@@ -259,7 +258,7 @@ class Illumination:
         found = [name if value is True else f"{name} {_short(value)}" for name, value in rest.items()]
         if self.planes == 1:
             return found
-        return [f"{self.planes} {'planes' if self.sensing.group else 'slices'}", *found]
+        return [f"{self.planes} {'planes' if self.sensing.summed else 'slices'}", *found]
 
     @property
     def light(self) -> str:
@@ -297,8 +296,8 @@ def unlike_windows(stream: Stream) -> list[str]:
     """Return the settings of a stored stream that training windows cannot have."""
     unlike = [name for name in stream.info.settings if name not in (*HONOURED, *STATED)]
     stated = replace(stream.info.sensing, bits=stream.info.bits)
-    planes = stream.sensor.levels - 1 if stated.group else stated.frames
-    if stream.timing != stated.timing(planes, stated.group):
+    planes = stream.sensor.levels - 1 if stated.summed else stated.frames
+    if stream.timing != stated.timing(planes, stated.summed):
         unlike.append(f"codes of {stream.info.planes_per_code} clip frames that its settings do not state")
     return unlike
 

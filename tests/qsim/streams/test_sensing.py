@@ -9,6 +9,7 @@ import random
 import time
 import warnings
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from qsim.streams import stream
 from qsim.streams.clip import Clip
 from qsim.streams.sensing import Sensing
 from qsim.streams.storing import sense
+from qsim.streams.stream_info import stored_settings
 
 FORK = multiprocessing.get_context("fork")  # everything is imported already: the processes start together
 
@@ -211,3 +213,12 @@ def test_planes_state_the_bits_of_their_sum(tmp_path: Path):
         Sensing("spad-320x240", planes=10, slices=2)
     with pytest.raises(ValueError, match="planes= is for a clocked SPAD"):
         write_clip(tmp_path / "c", frames=21, height=6, width=9).sense("quiver-physical", ppp=3, planes=10)
+
+
+def test_planes_and_group_exclude_each_other():
+    """`planes` alone sums; the settings that a stream states are those of `group`, as it has the planes itself."""
+    with pytest.raises(ValueError, match=r"group: sums 2\^bits - 1 planes, planes=10 sums others; leave it out"):
+        Sensing("spad-320x240", planes=10, group=True)
+    sensing = Sensing("spad-320x240", planes=10)
+    assert replace(sensing, ppp=2.0).summed
+    assert stored_settings(sensing) == {"group": True}
