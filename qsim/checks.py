@@ -17,12 +17,16 @@ SPLITS: tuple[str, ...] = get_args(kinds.Split)
 
 
 class ArgumentError(ValueError):
-    """A value that cannot be used, by the name of its argument; command lines replace the name by that of an option."""
+    """A value that cannot be used, by the name of its argument; command lines replace the name by that of an option.
 
-    def __init__(self, argument: str, problem: str) -> None:
-        super().__init__(f"{argument}: {problem}")
+    Of a flag that may be unset, `off` is the value False: its option is another one.
+    """
+
+    def __init__(self, argument: str, problem: str, *, off: bool = False) -> None:
+        super().__init__(f"{argument}{'=False' if off else ''}: {problem}")
         self.argument = argument
         self.problem = problem
+        self.off = off
 
 
 def suggest(word: str, known: Iterable[str]) -> str:

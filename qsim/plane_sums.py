@@ -3,7 +3,8 @@
     planes [T, H, W] of 0 and 1, at R planes per second  --PlaneSums-->  codes 0 ... N [T', H, W], at R / step
 
 A clocked SPAD stores single planes, and which sum is best depends on the scene. So the sum is chosen when a recording
-is read. A code of N planes has the exposure of N planes and N + 1 values; N need not be 2^b - 1.
+is read (`planes`). A code of N planes has the exposure of N planes and N + 1 values; N need not be 2^b - 1. A camera
+may have summed its planes itself: a file without a description does not say how many (`summed`).
 """
 
 from __future__ import annotations
@@ -51,17 +52,29 @@ class PlaneRange:
 
 @dataclass(frozen=True)
 class PlaneSums(PlaneRange):
-    """Which planes of a recording are used, and how many of them make a code."""
+    """Which frames of a recording are used, how many of them make a code, and how many planes each sums already."""
 
     planes: Annotated[
         Summed | None,
         setting(
-            "successive planes that are summed to a code: of single bits, or frames of a clip sensed now", unset="1"
+            "sum so many successive planes to a code: of a recording of single bits, or frames of a clip sensed now",
+            unset="1",
+        ),
+    ] = None
+    summed: Annotated[
+        Summed | None,
+        setting(
+            "file without a description: the camera has summed so many binary planes to each of its codes",
+            unset="2^bits - 1",
         ),
     ] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.planes is not None and self.summed is not None:
+            raise ArgumentError(
+                "planes", f"sums single planes, and with summed={self.summed} the codes are sums already; leave it out"
+            )
         if self.every is not None and self.every < (self.planes or 1):
             raise ArgumentError(
                 "every", f"{self.every}: codes of {self.planes} planes would share planes; give {self.planes} or more"
@@ -72,12 +85,15 @@ class PlaneSums(PlaneRange):
         """Whether a recording is changed at all."""
         return any(value is not None for value in vars(self).values())
 
-    def over(self, frames: int, where: str, *, bits: int | None = 1) -> Sums:
+    def over(self, frames: int, where: str, *, bits: int | None = 1, bare: bool = False) -> Sums:
         """Return the sums of a recording of so many frames of these bits.
 
-        `ArgumentError` for frames that do not exist, and for sums of frames of several bits; `ValueError` where no code
+        Those of a `bare` one, which states no sums, lie within `stored`. `ArgumentError` for frames that do not exist,
+        for sums of frames of several bits, and for `summed` of a recording that states it; `ValueError` where no code
         is left.
         """
+        if self.summed is not None and not bare:
+            raise ArgumentError("summed", f"{where} states what its codes sum; leave it out")
         planes = self.planes or 1
         start = self.start or 0
         stop = frames if self.stop is None else self.stop
@@ -94,8 +110,30 @@ class PlaneSums(PlaneRange):
         step = self.every or planes
         return Sums(planes, start, step, (stop - start - planes) // step + 1)
 
+    def stored(self, frames: int) -> Sums:
+        """Return the planes behind so many frames of a recording without a description."""
+        planes = self.summed or 1
+        return Sums(planes, 0, planes, frames)
+
 
 AS_STORED = PlaneSums()
+
+
+def within_sum(read: Read, planes: int, where: str) -> Read:
+    """Return a reader of codes that sum so many planes; it raises `ValueError` for a larger code."""
+
+    def checked(start: int, stop: int) -> Array:
+        codes = read(start, stop)
+        wrong = codes > planes
+        if wrong.any():
+            t, y, x = (int(i) for i in np.argwhere(wrong)[0])
+            raise ValueError(
+                f"{where}: code {codes[t, y, x]} at (t, y, x) = {(start + t, y, x)} is no sum of {planes} planes; give "
+                "the right summed="
+            )
+        return codes
+
+    return checked
 
 
 @dataclass(frozen=True)
@@ -111,6 +149,17 @@ class Sums:
     def bits(self) -> int:
         """The bits of a sum."""
         return self.planes.bit_length()
+
+    @property
+    def range(self) -> PlaneRange:
+        """The planes that are used, by their numbers in the recording."""
+        return PlaneRange(self.start, self.start + (self.codes - 1) * self.step + self.planes, self.step)
+
+    def within(self, stored: Sums) -> Sums:
+        """Return the same in planes, where the frames that are summed or chosen here are sums of planes themselves."""
+        return Sums(
+            self.planes * stored.planes, stored.start + self.start * stored.step, self.step * stored.step, self.codes
+        )
 
     def of(self, read: Read) -> Read:
         """Return a function that reads codes start ... stop - 1, uint8 or (above 8 bits) uint16 [n, H, W]."""

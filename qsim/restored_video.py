@@ -19,6 +19,7 @@ from qsim.checks import check_video
 from qsim.files import Progress, load_array
 from qsim.frame_times import Times
 from qsim.kinds import Count, Digest, NotNegative, Positive, Text, Whole
+from qsim.plane_sums import PlaneRange
 
 _CURE = "restore the video again"
 
@@ -36,6 +37,7 @@ class VideoInfo:
     frame_rate: Positive | None = None  # Hz
     plane_rate: Positive | None = None  # Hz, of the planes behind the codes, where codes are sums of planes
     planes_per_code: Whole = 1
+    planes: PlaneRange | None = None  # of the recording that are used, where codes are sums or some of all
     times: Times | None = None  # of the frames
     exposure: Positive | None = None  # s
     sensor: dict[str, Any] = field(default_factory=dict)  # as its record describes itself

@@ -40,6 +40,7 @@ class FrameStatistics:
     adjacent: Array | None = None  # float64 [2, H, W], sum of code x code of the pixel below, and of that to the right
     sample: Array | None = None  # codes [t, h, w] of the first frames, of every `stride`-th row and column
     stride: int = 1
+    rates: str = ""  # of the codes and of the planes that they sum, in words
 
     @property
     def pixels(self) -> int:
@@ -227,7 +228,7 @@ def _as_values(block: Array, top: int, what: str, name: str, frame: int) -> Arra
         t, y, x = (int(i) for i in np.argwhere(wrong)[0])
         cure = ""
         if top == 1 and block[t, y, x] > 1:
-            cure = "; sums of N binary planes are calibrated with planes=N"
+            cure = "; sums of N binary planes are calibrated with summed=N"
         raise ValueError(
             f"{name}: {block[t, y, x]} at (t, y, x) = ({frame + t}, {y}, {x}) is not a {what}, 0..{top}{cure}"
         )

@@ -26,7 +26,7 @@ from qsim.files import load_array
 from qsim.formats import importing, photon_times
 from qsim.formats.mat_files import mat_array
 from qsim.formats.recording import Hints
-from qsim.plane_sums import AS_STORED, PlaneRange, PlaneSums, Read, Sums
+from qsim.plane_sums import AS_STORED, PlaneSums, Read, Sums
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
@@ -46,24 +46,25 @@ def read_stack(
     exposure: float,
     photons: float | None,
     hints: Hints = Hints(),  # noqa: B008 (frozen)
-    planes: int | None = None,
-    single: bool = False,
-    frames: PlaneRange = AS_STORED,
+    sums: PlaneSums = AS_STORED,
 ) -> FrameStatistics:
     """Return the statistics of the frames in a file: `.npy` of integer values, a stream, or any recording of `convert`.
 
-    `exposure` in seconds, `photons` per pixel and exposure. `hints` state where the values lie (its `bits` do not
-    count); with a `width` and no `layout` an `.npy` is a photon cube of packed planes. With `planes` every value sums
-    this number of binary planes. Single planes (a stream or a cube of one bit, or `single`) are summed when they are
-    read. `frames` chooses some of the file's. `ValueError` or `FileNotFoundError` naming the file.
+    `exposure` in seconds, `photons` per pixel and exposure, both of one plane where planes are summed. `hints` state
+    where the values lie (its `bits` do not count); with a `width` and no `layout` an `.npy` is a photon cube of packed
+    planes. `sums` chooses frames of the file, sums its single planes, or says that its values are sums already.
+    `ValueError` or `FileNotFoundError` naming the file.
     """
-    stored = _stored(path, bits, exposure, planes, single, hints)
-    together = planes if planes is not None and stored.bits == 1 and planes > 1 else 1
-    chosen = PlaneSums(frames.start, frames.stop, frames.every, together).over(stored.shape[0], str(path))
+    stored = _stored(path, 1 if (sums.planes or 1) > 1 else bits, exposure, sums, hints)
+    chosen = sums.over(stored.shape[0], str(path), bits=stored.bits, bare=True)
+    told = chosen.within(sums.stored(stored.shape[0]))
     blocks = _blocks(stored, chosen)
-    if planes is None:
-        return measure(blocks, bits=bits, exposure=exposure, photons=photons, name=str(path))
-    return measure_sums(blocks, planes=planes, exposure=exposure, photons=photons, name=str(path))
+    if told.planes == 1:
+        found = measure(blocks, bits=bits, exposure=exposure, photons=photons, name=str(path))
+    else:
+        found = measure_sums(blocks, planes=told.planes, exposure=exposure, photons=photons, name=str(path))
+    rate = None if stored.frame_rate is None else stored.frame_rate * (sums.summed or 1)
+    return replace(found, rates=told.words(rate))
 
 
 @dataclass(frozen=True)
@@ -73,33 +74,36 @@ class _Stored:
     shape: tuple[int, ...]
     read: Read
     bits: int
+    frame_rate: float | None = None  # Hz, if the file states it
 
 
-def _stored(path: Path, bits: int, exposure: float, planes: int | None, single: bool, hints: Hints) -> _Stored:
-    """Return the frames of a file, which sums of planes hold as such or as single planes."""
+def _stored(path: Path, bits: int, exposure: float, sums: PlaneSums, hints: Hints) -> _Stored:
+    """Return the frames of a file: values of so many bits, sums of planes, or single planes that will be summed."""
+    planes = None if sums.summed == 1 else sums.summed
     if planes is not None:
-        bits = 1 if single else planes.bit_length()
+        bits = planes.bit_length()
     stream = stream_of(path)
     if stream is not None:
         if hints.width not in (None, stream.shape[2]):
             raise ValueError(
                 f"{path}: is a stream of {stream.shape[2]} pixels per row, not {hints.width}; leave width= out"
             )
-        bits = 1 if stream.bits == 1 and planes is not None else bits
-        return _of_array(read_counts(path, replace(hints, width=None), bits, _seconds(bits, exposure, planes)), bits)
+        own = stream.sensor.levels - 1 if stream.sensor.sums_planes else 1
+        if planes not in (None, own):
+            raise ValueError(f"{path}: is a stream of sums of {own} planes, not {planes}; give what it states")
+        codes = read_counts(path, replace(hints, width=None), bits, _seconds(bits, exposure, planes))
+        return replace(_of_array(codes, bits), frame_rate=stream.info.frame_rate)
     bare = hints == Hints(variable=hints.variable)
     if bare and path.suffix in (".npy", ".mat"):
         return _of_array(read_counts(path, hints, bits, _seconds(bits, exposure, planes)), bits)
     if bare and path.suffix.lower() == ".npz":
-        parts = None if single else planes
-        return _of_array(_photon_codes(path, bits, exposure, parts), bits)
+        return _of_array(_photon_codes(path, bits, exposure, planes), bits)
     if path.suffix == ".npy" and hints.layout is None:  # dark planes could be several layouts
         hints = replace(hints, layout="codes" if hints.width is None else "cube")
-        bits = bits if hints.width is None or planes is None else 1
     recording = importing.read(path, replace(hints, bits=min(bits, 16)), compared=("bits",))
     if recording.is_light or recording.bits != bits:
         raise ValueError(f"{path}: holds {recording.format}, not values of {bits} bits")
-    return _Stored(recording.shape, recording.read, bits)
+    return _Stored(recording.shape, recording.read, bits, recording.frame_rate)
 
 
 def _seconds(bits: int, exposure: float, planes: int | None) -> float:
@@ -206,11 +210,12 @@ _UNMEASURED = {
 }
 
 
-def to_toml(found: Calibration, title: str, stem: str = "") -> str:
+def to_toml(found: Calibration, title: str, stem: str = "", *, own_pixels: bool = False) -> str:
     """Return the sensor as a device file, each number with its interval and method as its source.
 
-    The maps of file names that begin with `stem` are in comments, because they fit only frames that are not larger. The
-    file of a SPAD states no bits: its pixels are the same at every depth of a code.
+    The map of dark counts, of a name that begins with `stem`, is a table of the file with `own_pixels`. Else it is in
+    comments, because it fits only frames that are not larger. The file of a SPAD states no bits: its pixels are the
+    same at every depth of a code.
     """
     lines = [f"# {title}", "[sensor]"]
     described = sensor_of(found).to_dict()
@@ -225,10 +230,12 @@ def to_toml(found: Calibration, title: str, stem: str = "") -> str:
         elif key in _UNMEASURED:
             lines.append(f'{key} = "{_UNMEASURED[key]}"')
     if "dark_count_rate" in found.maps:
-        lines += ["", "# [defects]  # uncomment to give every pixel its own dark counts"]
-        lines += [f'# dark_map = "{stem}{_DARK_MAP}"']
         hot = int(found.maps["hot_pixels"].sum())
-        lines += [f"# hot pixels: {hot}, true in {stem}{_HOT_MAP}, as in `quiver restore`, defects={stem}{_HOT_MAP}"]
+        lines += ["", f"# {hot} hot pixels, true in {stem}{_HOT_MAP}, which `quiver restore` takes as --defects"]
+        mark = "" if own_pixels else "# "
+        if not own_pixels:
+            lines += ["# Every pixel gets its own dark counts by the two lines below, without their #"]
+        lines += [f"{mark}[defects]", f'{mark}dark_map = "{stem}{_DARK_MAP}"']
     return "\n".join(lines) + "\n"
 
 
@@ -321,7 +328,7 @@ def beside(path: Path) -> dict[str, Path]:
     }
 
 
-def write(found: Calibration, path: Path, title: str) -> list[Path]:
+def write(found: Calibration, path: Path, title: str, *, own_pixels: bool = False) -> list[Path]:
     """Write all files of a calibration, the sensor file last; return their paths."""
     names = beside(path)
     maps = [name for name in ("dark_count_rate", "hot_pixels") if name in found.maps]
@@ -333,5 +340,5 @@ def write(found: Calibration, path: Path, title: str) -> list[Path]:
             kind = np.float32 if name == "dark_count_rate" else np.bool_
             with files.replacing(array) as file:
                 np.save(file, found.maps[name].astype(kind))
-        files.write_bytes(text, to_toml(found, title, path.stem).encode())
+        files.write_bytes(text, to_toml(found, title, path.stem, own_pixels=own_pixels).encode())
     return written

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 from qsim.cli.command import Idle, command
 from qsim.cli.console import output, refuse_existing
 from qsim.formats.recording import Hints, Layout
-from qsim.kinds import Bits, Planes, Positive
-from qsim.plane_sums import PlaneRange
+from qsim.kinds import Bits, Positive
+from qsim.plane_sums import PlaneSums
 from qsim.settings import setting
 
 COUNTS = 8  # bits; larger codes of a SPAD may be sums of planes, which the user must state
@@ -42,29 +42,32 @@ class Calibrate:
         ),
     ] = None
     bits: Annotated[
-        Bits | None, setting("bits per code; 1 for binary planes", unset="with --planes of 2 or more: 1")
-    ] = None
-    planes: Annotated[
-        Planes | None,
+        Bits | None,
         setting(
-            "spad: every value is the sum of this many binary planes, or with --bits 1 is made so; SECONDS and PHOTONS "
-            "are those of one plane; 1: values are single exposures"
+            "bits per code; 1 for binary planes", unset="needed, unless planes are summed, by --planes or --summed"
         ),
     ] = None
-    model: Annotated[Literal["qis", "spad"] | None, setting("kind of sensor", unset="qis; spad with --planes")] = None
+    model: Annotated[
+        Literal["qis", "spad"] | None, setting("kind of sensor", unset="qis; spad with --planes or --summed")
+    ] = None
+    own_pixels: Annotated[
+        bool,
+        setting("spad: the file gives every pixel its measured dark counts, and fits frames of this size alone"),
+    ] = False
     paralyzable: Annotated[bool, setting("spad: every arrival restarts the dead time")] = False
     ignore_dead_time: Annotated[bool, setting("spad: model the counts as Poisson")] = False
     force: Annotated[bool, setting("replace existing files")] = False
 
-    @property
-    def kind(self) -> str:
-        """The kind of sensor: as given, else as the frames say."""
-        return self.model or ("spad" if self.static or self.planes is not None else "qis")
 
-    @property
-    def sums(self) -> bool:
-        """Whether every value is the sum of several binary planes."""
-        return self.planes is not None and self.planes > 1
+def _kind(asked: Calibrate, sums: PlaneSums) -> str:
+    """Return the kind of sensor: as given, else as the frames say."""
+    of_planes = sums.planes is not None or sums.summed is not None
+    return asked.model or ("spad" if asked.static or of_planes else "qis")
+
+
+def _planes(sums: PlaneSums) -> int:
+    """Return the binary planes in a value."""
+    return sums.planes or sums.summed or 1
 
 
 def _is_packed(layout: Layout) -> bool:
@@ -87,32 +90,58 @@ IDLE = (
     Idle(
         lambda asked, *_: (
             "a QIS is calibrated from its own codes; for sums of binary planes add --model spad"
-            if asked.kind == "qis"
+            if asked.model == "qis"
             else ""
         ),
-        ("planes",),
+        ("planes", "summed"),
     ),
     Idle(
-        lambda asked, *_: "binary planes have no dead time for --static to find" if asked.sums and asked.static else "",
-        ("planes",),
+        lambda asked, _, sums: (
+            "binary planes have no dead time for --static to find" if _planes(sums) > 1 and asked.static else ""
+        ),
+        ("planes", "summed"),
     ),
     Idle(
-        lambda asked, *_: (
-            "" if asked.kind == "spad" and not asked.static else "it is for --model spad with dark and flat frames"
+        lambda asked, _, sums: (
+            ""
+            if _kind(asked, sums) == "spad" and not asked.static
+            else "it is for --model spad with dark and flat frames"
         ),
         ("ignore_dead_time",),
     ),
-    Idle(lambda asked, *_: "" if asked.kind == "spad" else "it is for --model spad and --static", ("paralyzable",)),
+    Idle(
+        lambda asked, _, sums: "" if _kind(asked, sums) == "spad" else "it is for --model spad and --static",
+        ("paralyzable",),
+    ),
+    Idle(
+        lambda asked, _, sums: (
+            "" if _kind(asked, sums) == "spad" and asked.dark else "it is for --model spad with dark frames"
+        ),
+        ("own_pixels",),
+    ),
     Idle(lambda asked, *_: "--ignore-dead-time takes no dead time" if asked.ignore_dead_time else "", ("paralyzable",)),
     Idle(
-        lambda asked, *_: f"--planes {asked.planes} are 1-bit planes" if asked.sums and asked.bits != 1 else "",
+        lambda asked, _, sums: (
+            f"sums of {_planes(sums)} planes have bits of their own" if _planes(sums) > 1 and asked.bits != 1 else ""
+        ),
+        ("bits",),
+    ),
+    Idle(
+        lambda asked, _, sums: (
+            "single planes have 1 bit, and --summed says that values are sums of several"
+            if (sums.summed or 1) > 1 and asked.bits == 1
+            else ""
+        ),
         ("bits",),
     ),
     Idle(
         lambda asked, *_: "the counts of --static are used as a whole" if asked.static else "",
         ("start", "stop", "every"),
     ),
-    Idle(lambda asked, *_: _NO_DEAD_TIME if asked.sums or asked.bits == 1 else "", ("ignore_dead_time", "paralyzable")),
+    Idle(
+        lambda asked, _, sums: _NO_DEAD_TIME if _planes(sums) > 1 or asked.bits == 1 else "",
+        ("ignore_dead_time", "paralyzable"),
+    ),
     Idle(
         lambda asked, layout, _: (
             "it is for packed binary planes, and counts are read one by one"
@@ -138,7 +167,7 @@ IDLE = (
     "qsim calibrate --bits 8 --static counts.npy 6.33e-6 -o counter.toml",
     idle=IDLE,
 )
-def calibrate(asked: Calibrate, layout: Layout, frames: PlaneRange) -> int:
+def calibrate(asked: Calibrate, layout: Layout, sums: PlaneSums) -> int:
     """Measure the sensor, write its files and print its numbers."""
     from qsim.calibration import sensor_file
     from qsim.calibration.qis import calibrate_qis
@@ -146,10 +175,10 @@ def calibrate(asked: Calibrate, layout: Layout, frames: PlaneRange) -> int:
 
     if asked.output.suffix != ".toml":
         raise ValueError(f"{asked.output}: the sensor file is a .toml, as in -o my_sensor.toml")
-    model, bits = _calibration_kind(asked)
+    model, bits = _calibration_kind(asked, sums)
     _check_outputs(asked, model)
-    darks = [_stack(words, asked, layout, frames, dark=True) for words in asked.dark]
-    flats = [_stack(words, asked, layout, frames, dark=False) for words in asked.flat]
+    darks = [_stack(words, asked, layout, sums, dark=True) for words in asked.dark]
+    flats = [_stack(words, asked, layout, sums, dark=False) for words in asked.flat]
     if asked.static:
         found = _static(asked, layout, bits)
     elif model == "qis":
@@ -161,14 +190,17 @@ def calibrate(asked: Calibrate, layout: Layout, frames: PlaneRange) -> int:
     asked.output.parent.mkdir(parents=True, exist_ok=True)
     stacks = f"{len(darks)} dark and {len(flats)} flat stacks"
     origin = f"counts of the static scene {asked.static[0].name}" if asked.static else stacks
-    written = sensor_file.write(found, asked.output, f"calibrated from {origin}")
+    written = sensor_file.write(found, asked.output, f"calibrated from {origin}", own_pixels=asked.own_pixels)
     width = max(len(name) for name in found.values)
-    assumed = _assumed(asked, model, bits)
-    text = [f"taken as: {assumed}"]
+    assumed = _assumed(asked, sums, model, bits)
+    files = [words[0] for words in (*asked.dark, *asked.flat)]
+    rates = {name: stack.rates for name, stack in zip(files, (*darks, *flats), strict=True)} if not asked.static else {}
+    text = [f"taken as: {assumed}", *(f"{name}: {words}" for name, words in rates.items())]
     text += [f"{name:{width}}  {value}  ({value.method})" for name, value in found.values.items()]
     text += [f"warning: {words}" for words in found.warnings]
     text += ["written: " + ", ".join(str(path) for path in written)]
-    output(sensor_file.as_dict(found) | {"assumed": assumed, "files": [str(path) for path in written]}, text)
+    told = {"assumed": assumed, "rates": rates, "files": [str(path) for path in written]}
+    output(sensor_file.as_dict(found) | told, text)
     return 0
 
 
@@ -191,28 +223,29 @@ def _check_outputs(asked: Calibrate, model: str) -> None:
         refuse_existing(path, asked.force)
 
 
-def _calibration_kind(asked: Calibrate) -> tuple[str, int]:
+def _calibration_kind(asked: Calibrate, sums: PlaneSums) -> tuple[str, int]:
     """Return (qis or spad, bits of a code); `ValueError` if they are not stated."""
-    if asked.bits is None and not asked.sums:
-        raise ValueError("--bits: is needed, as in --bits 8; for sums of binary planes give --planes instead")
+    if asked.bits is None and _planes(sums) == 1:
+        raise ValueError("--bits: is needed, as in --bits 8; for sums of N binary planes give --summed N instead")
     bits = asked.bits or 1
-    if asked.kind == "spad" and bits > COUNTS and asked.planes is None and not asked.static:
+    kind = _kind(asked, sums)
+    if kind == "spad" and bits > COUNTS and sums.summed is None and not asked.static:
         raise ValueError(
-            f"--bits {bits}: values this large may be sums of binary planes; give --planes N for sums of N planes, or "
-            "--planes 1 if every value counts one exposure"
+            f"--bits {bits}: values this large may be sums of binary planes; give --summed N for sums of N planes, or "
+            "--summed 1 if every value counts one exposure"
         )
-    return asked.kind, bits
+    return kind, bits
 
 
-def _assumed(asked: Calibrate, model: str, bits: int) -> str:
+def _assumed(asked: Calibrate, sums: PlaneSums, model: str, bits: int) -> str:
     """Return a line that states how the numbers in the files are interpreted."""
-    if asked.planes is not None and asked.planes > 1:
-        made = ", made of single planes" if asked.bits == 1 else ""
-        return f"sums of {asked.planes} binary planes of a SPAD{made}; seconds and photons are those of one plane"
+    if _planes(sums) > 1:
+        made = ", made of single planes" if sums.summed is None else ""
+        return f"sums of {_planes(sums)} binary planes of a SPAD{made}; seconds and photons are those of one plane"
     if asked.static:
-        return f"counts of one exposure each, {bits} bits, of a static scene (for sums of planes: --planes)"
+        return f"counts of one exposure each, {bits} bits, of a static scene"
     if model == "spad" and bits > 1:
-        return f"counts of one exposure each, {bits} bits (for sums of N binary planes: --planes N)"
+        return f"counts of one exposure each, {bits} bits (for sums of N binary planes: --summed N)"
     return f"{'binary planes of a SPAD' if model == 'spad' else f'{bits}-bit codes of a QIS'}"
 
 
@@ -238,7 +271,7 @@ def _number(word: str) -> float:
         raise ValueError(f"{word!r} is not a number; give seconds, as in 1e-3") from None
 
 
-def _stack(words: tuple[str, ...], asked: Calibrate, layout: Layout, frames: PlaneRange, *, dark: bool) -> Any:
+def _stack(words: tuple[str, ...], asked: Calibrate, layout: Layout, sums: PlaneSums, *, dark: bool) -> Any:
     from qsim.calibration.sensor_file import read_stack
 
     kind, most = ("--dark", 2) if dark else ("--flat", 3)
@@ -254,7 +287,5 @@ def _stack(words: tuple[str, ...], asked: Calibrate, layout: Layout, frames: Pla
         exposure=numbers[0],
         photons=photons,
         hints=_hints_of(layout),
-        planes=asked.planes if asked.planes != 1 else None,
-        single=asked.sums and asked.bits == 1,
-        frames=frames,
+        sums=sums,
     )

@@ -68,7 +68,8 @@ class Command:
         """
         options = self.options
         if isinstance(error, ArgumentError):
-            text = f"{options.get(error.argument, error.argument)}: {error.problem}"
+            name = options.get(error.argument, error.argument)
+            text = f"{name.replace('--', '--no-') if error.off else name}: {error.problem}"
 
         def option(found: re.Match[str]) -> str:
             name = options.get(found["name"]) or (None if found["call"] else others().get(found["name"]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,14 +11,13 @@ from qsim.cli.command import Idle, command
 from qsim.cli.completion import sensors
 from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, in_options, note, output, running
 from qsim.cli.options import check_free
-from qsim.dataset.clip_list import ClipList
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
 from qsim.formats.recording import Hints, Recording
-from qsim.formats.summing import sum_planes
+from qsim.formats.summing import sum_planes, summed
 from qsim.kinds import Positive, Split, Text, Whole
-from qsim.plane_sums import PlaneSums
+from qsim.plane_sums import AS_STORED, PlaneSums
 from qsim.restored_video import describes_restored
 from qsim.settings import setting, settings_of
 from qsim.streams.clip import Clip
@@ -178,6 +176,8 @@ def convert(asked: Convert, hints: Hints, sums: ConvertedSums) -> int:
 def _export_sums(asked: Convert, hints: Hints, sums: PlaneSums) -> list[tuple[Path, str]]:
     """Write sums of a stream's planes as a stream, or with a kind of output for others."""
     source = asked.source
+    if asked.kind == "pairs":
+        return [_pairs(asked, sums)]
     if asked.is_light:
         raise ValueError(
             f"{source}: planes are summed and chosen in a stream; name one of its streams, as in "
@@ -188,25 +188,28 @@ def _export_sums(asked: Convert, hints: Hints, sums: PlaneSums) -> list[tuple[Pa
         with bar("summing") as progress:
             made = sum_planes(stream, sums, asked.output, force=asked.force, progress=progress)
         return [(made.path, f"{_size(made)}, {made.bits}-bit codes, {made.rates}")]
-    with tempfile.TemporaryDirectory() as folder:
-        between = sum_planes(stream, sums, Path(folder) / f"{stream.name}.npy")
-        path, about = _export(replace(asked, input=between.path), hints)[0]
-        return [(path, f"{about}, {between.rates}")]
+    made = summed(stream, sums)
+    path, about = exporting.described(made, asked.output, _wanted(asked, hints), force=asked.force)
+    return [(path, f"{about}, {made.rates}")]
+
+
+def _wanted(asked: Convert, hints: Hints) -> exporting.Export:
+    """Return the format of what is written for others."""
+    if asked.kind is None:
+        raise ValueError(f"{asked.output}: name the kind of output with --to: {', '.join(KINDS)}")
+    planes = asked.window or challenge.PLANES
+    return exporting.Export(asked.kind, hints.transfer or "gamma 2.2", hints.white, not asked.lossy, planes=planes)
 
 
 def _export(asked: Convert, hints: Hints) -> list[tuple[Path, str]]:
-    kind = asked.kind
     source = asked.source
-    if kind is None:
-        raise ValueError(f"{asked.output}: name the kind of output with --to: {', '.join(KINDS)}")
-    planes = asked.window or challenge.PLANES
-    wanted = exporting.Export(kind, hints.transfer or "gamma 2.2", hints.white, not asked.lossy, planes=planes)
-    if kind == "pairs":
-        return [_pairs(asked)]
+    wanted = _wanted(asked, hints)
+    if wanted.kind == "pairs":
+        return [_pairs(asked, AS_STORED)]
     if not (source / "dataset.json").is_file():
         opened = Stream.open(source) if source.suffix == ".json" else Clip.open(source)
         return [exporting.described(opened, asked.output, wanted, force=asked.force)]
-    suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr", "spike": ".dat", "photons": ".npz"}.get(kind, "")
+    suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr", "spike": ".dat", "photons": ".npz"}.get(wanted.kind, "")
     check_free(asked.output)
     running().after_interrupt = MAKES_AGAIN
     made = []
@@ -222,19 +225,20 @@ def _export(asked: Convert, hints: Hints) -> list[tuple[Path, str]]:
     return made
 
 
-def _pairs(asked: Convert) -> tuple[Path, str]:
-    """Write the windows of a data set or a clip."""
-    if asked.source.suffix == ".json":
-        raise ValueError(
-            f"{asked.source}: pairs are made of a data set or a clip, with all its streams; name its folder"
-        )
+def _pairs(asked: Convert, sums: PlaneSums) -> tuple[Path, str]:
+    """Write the windows of a data set, a clip, or one stream of a clip."""
     if (asked.source / "dataset.json").is_file():
         data = Dataset.open(asked.source)
-        splits = {split: data.clips(split) for split in SPLITS}
+        streams = {split: pairs.streams_of(data.clips(split)) for split in SPLITS}
+    elif asked.is_light:
+        streams = {"all": pairs.streams_of([Clip.open(asked.source)])}
     else:
-        splits = {"all": ClipList.of([Clip.open(asked.source)])}
+        stream = Stream.open(asked.source)
+        folder = stream.clip
+        streams = {"all": [(Clip(folder.path, folder.info, folder.keeps), stream)]}
+    frames = asked.window or pairs.WINDOW
     with bar("converting", "window") as progress:
-        about = pairs.write(splits, asked.output, asked.window or pairs.WINDOW, force=asked.force, progress=progress)
+        about = pairs.write(streams, asked.output, frames, sums=sums, force=asked.force, progress=progress)
     return asked.output, about
 
 
@@ -276,8 +280,8 @@ def _import(asked: Convert, hints: Hints, sums: PlaneSums) -> list[tuple[Path, s
                 _tell_reading(source, recording)
                 continue
             stream = importing.to_stream(recording, target, capture, sums=sums, force=asked.force, progress=progress)
-            rates = "" if stream.sums is None else f", {stream.rates}"
-            made.append((stream.path, f"{_size(stream)}, {stream.bits}-bit codes, {recording.format}{rates}"))
+            about = f"{stream.bits}-bit codes, {recording.format}, {stream.rates}"
+            made.append((stream.path, f"{_size(stream)}, {about}"))
             _tell_reading(source, recording)
     return made
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import scratch
-from qsim.checks import file_path
+from qsim.checks import ArgumentError, file_path
 from qsim.clip import exr
 from qsim.clip.clip_info import ClipInfo, Saturation
 from qsim.clip.manifest import check_outside
@@ -29,9 +29,8 @@ from qsim.files import Progress
 from qsim.formats import gaps
 from qsim.formats.detection import ASSUMED, LAYOUTS, detect
 from qsim.formats.recording import Hints, Marked, Recording, reoriented, with_stated_layout
-from qsim.frame_times import Times
 from qsim.kinds import Split
-from qsim.plane_sums import AS_STORED, PlaneSums, Sums
+from qsim.plane_sums import AS_STORED, PlaneSums, within_sum
 from qsim.sensor import colour_filter, devices, packing
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
@@ -203,7 +202,8 @@ def to_stream(
 ) -> Stream:
     """Write codes as a stream without a clip: PATH.npy and PATH.json. The default sensor is an ideal counter.
 
-    Planes of one bit are summed as asked; the rate and the exposure of `capture` are those of a plane. Tables [defects]
+    Planes of one bit are summed as asked; the rate and the exposure of `capture` are those of a frame of the recording:
+    of a plane, or of a sum that the camera made. Codes that are chosen or summed have their times. Tables [defects]
     and [colour] of a sensor's file are stored: they belong to the frames as they are written.
     """
     if recording.bits is None:
@@ -214,11 +214,15 @@ def to_stream(
     npy = free_stream(path, force)
     length, height, width = recording.shape
     capture = _as_stated(path, recording, capture)
-    taken = sums.over(length, recording.format, bits=recording.bits)
-    sensor, tables = _tables(capture, _sensor(recording, capture, taken.planes), height, width)
+    taken = sums.over(length, recording.format, bits=recording.bits, bare=recording.source.bitplanes is None)
+    if sums.summed is not None:
+        recording = _of_sums(recording, sums.summed, path)
+    many = taken.planes * (sums.summed or 1)
+    sensor, tables = _tables(capture, _sensor(recording, capture, many), height, width)
     model = recording.code_model if sensor.sums_planes else sensor.code_model
-    times = recording.times if taken.codes == length else _times(recording, capture, taken)
-    planes = taken.planes
+    chosen = taken.codes != length or taken.planes > 1
+    times = taken.times(capture.frame_rate, recording.times) if chosen else recording.times
+    planes = many
     if planes == 1 and model == "binary_sum":
         planes = sensor.levels - 1
     frames = taken.codes
@@ -240,7 +244,7 @@ def to_stream(
         code_model=model,
         planes_per_code=planes,
         frame_rate=capture.frame_rate / taken.step,
-        plane_rate=None if taken.step == taken.planes else capture.frame_rate,
+        plane_rate=None if taken.step == taken.planes else capture.frame_rate * (sums.summed or 1),
         exposure=capture.seconds * taken.planes,
         source=recording.source,
         times=times,
@@ -249,9 +253,14 @@ def to_stream(
     return write_packed(npy, packed(), info)
 
 
-def _times(recording: Recording, capture: Import, taken: Sums) -> Times | None:
-    """Return the times of codes that some of a recording's planes make, if the recording states any."""
-    return None if recording.times is None else taken.times(capture.frame_rate, recording.times)
+def _of_sums(recording: Recording, planes: int, path: Path) -> Recording:
+    """Return a recording whose codes a camera made as sums of so many planes."""
+    bits = recording.bits or 1
+    if planes.bit_length() > bits or recording.code_model != "binary_sum":
+        held = f"{bits}-bit codes ({recording.code_model})"
+        raise ArgumentError("summed", f"{recording.format} holds {held}, no sums of {planes} planes; leave it out")
+    read = within_sum(recording.read, planes, str(path))
+    return replace(recording, bits=planes.bit_length(), read=read)
 
 
 def _check_stream(path: Path, recording: Recording, capture: Import) -> None:
@@ -313,7 +322,10 @@ def _sensor(recording: Recording, capture: Import, planes: int) -> Sensor:
     stored = recording.source.bitplanes
     if capture.sensor is not None and (planes > 1 or stored is not None):
         many = stored or planes
-        return devices.load_sum(capture.sensor, many, ppp=capture.ppp, exposure=capture.seconds / (stored or 1))
+        whole = (recording.bits or 1) > 1  # the seconds of a frame are those of its sum
+        seconds = capture.seconds / (many if whole else 1)
+        named = "summed" if whole else "planes"
+        return devices.load_sum(capture.sensor, many, ppp=capture.ppp, exposure=seconds, argument=named)
     if capture.sensor is not None:
         return devices.load(capture.sensor, ppp=capture.ppp, bits=recording.bits, exposure=capture.seconds)
     if recording.code_model == CountingSPAD.code_model:

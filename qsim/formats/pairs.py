@@ -13,7 +13,7 @@ A window is T successive codes of a stream; windows do not overlap. One chunk ho
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,13 +21,17 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.checks import ArgumentError
 from qsim.clip.manifest import check_outside
 from qsim.files import VERSION, Progress, replacing
+from qsim.formats.summing import summed
+from qsim.plane_sums import AS_STORED, PlaneSums
 from qsim.streams.clip import Clip
 from qsim.streams.code_truth import CodeTruth
 from qsim.streams.stream import Stream
 
 WINDOW = 11  # frames, as QUIVER takes them
+Sensed = tuple[Clip, Stream]
 
 
 @dataclass(frozen=True)
@@ -70,24 +74,37 @@ class Window:
         return {"first": self.first} | light | rates | names
 
 
-def windows(splits: Mapping[str, Sequence[Clip]], frames: int) -> dict[str, list[Window]]:
-    """Return the windows of all streams, by split; `ValueError` for none, and for clips of unequal sizes."""
+def streams_of(clips: Iterable[Clip]) -> list[Sensed]:
+    """Return all streams of some clips, each with its clip."""
+    return [(clip, clip.stream(name)) for clip in clips for name in clip.streams]
+
+
+def windows(
+    splits: Mapping[str, Sequence[Sensed]], frames: int, sums: PlaneSums = AS_STORED
+) -> dict[str, list[Window]]:
+    """Return the windows of all streams, by split; `ValueError` for none, and for clips of unequal sizes.
+
+    Streams of planes are summed as asked, from the first plane on: their truth is that of codes that follow each other.
+    """
+    for name in ("start", "stop", "every"):
+        if getattr(sums, name) is not None:
+            raise ArgumentError(name, "windows of pairs are made of all codes of a stream; leave it out")
     found: dict[str, list[Window]] = {}
-    for split, clips in splits.items():
-        for clip in clips:
+    for split, sensed in splits.items():
+        for clip, stored in sensed:
             clip.require_one_band("a file of pairs")
-            for stream in map(clip.stream, clip.streams):
-                if stream.shares is not None:
-                    raise ValueError(
-                        f"{stream.path}: its codes have different exposures, those of a window have one; use "
-                        "another stream"
-                    )
-                for first in range(0, len(stream) - frames + 1, frames):
-                    found.setdefault(split, []).append(Window(clip, stream, first, frames))
+            if stored.shares is not None:
+                raise ValueError(
+                    f"{stored.path}: its codes have different exposures, those of a window have one; use another stream"
+                )
+            stream = summed(stored, sums)
+            for first in range(0, len(stream) - frames + 1, frames):
+                found.setdefault(split, []).append(Window(clip, stream, first, frames))
     if not found:
-        clips = [clip for clips in splits.values() for clip in clips]
-        there = "no stream" if not any(clip.streams for clip in clips) else f"no stream of {frames} codes"
-        raise ValueError(f"{there} in {len(clips)} clips; make streams with `qsim sense`, or give a smaller window=")
+        number = sum(map(len, splits.values()))
+        raise ValueError(
+            f"no window of {frames} codes in {number} streams; make some with `qsim sense`, or give a smaller window="
+        )
     every = [window for group in found.values() for window in group]
     sizes = {window.clip.shape[1:]: window.clip.name for window in every}
     if len(sizes) > 1:
@@ -99,10 +116,11 @@ def windows(splits: Mapping[str, Sequence[Clip]], frames: int) -> dict[str, list
 
 
 def write(
-    splits: Mapping[str, Sequence[Clip]],
+    splits: Mapping[str, Sequence[Sensed]],
     path: Path,
     frames: int,
     *,
+    sums: PlaneSums = AS_STORED,
     force: bool = False,
     progress: Progress | None = None,
 ) -> str:
@@ -112,7 +130,7 @@ def write(
     """
     import h5py
 
-    groups = windows(splits, frames)
+    groups = windows(splits, frames, sums)
     _check_target(path, force)
     path.parent.mkdir(parents=True, exist_ok=True)
     total = sum(map(len, groups.values()))

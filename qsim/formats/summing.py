@@ -1,4 +1,4 @@
-"""Writes sums of the planes of a stored stream as a stream of its own, or for other programs.
+"""Sums the planes of a stored stream, or chooses some of its codes: when they are read, or as a stream of its own.
 
 NAME.npy + NAME.json (planes of 1 bit)  --PlaneSums-->  a stream of codes, which states the rates of both
 """
@@ -6,6 +6,7 @@ NAME.npy + NAME.json (planes of 1 bit)  --PlaneSums-->  a stream of codes, which
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from numpy import ndarray as Array
@@ -13,7 +14,8 @@ from numpy import ndarray as Array
 from qsim.checks import ArgumentError
 from qsim.files import Progress
 from qsim.formats.importing import free_stream
-from qsim.plane_sums import PlaneSums
+from qsim.optics.radiometry import Crop
+from qsim.plane_sums import PlaneSums, Read, Sums
 from qsim.sensor import packing
 from qsim.streams.stream import Stream, write_packed
 from qsim.streams.stream_info import StreamInfo, StreamLight
@@ -21,19 +23,61 @@ from qsim.streams.stream_info import StreamInfo, StreamLight
 _TOGETHER = 1 << 22  # codes that are packed at a time
 
 
+@dataclass(frozen=True, eq=False)
+class SummedStream(Stream):
+    """The codes that sums of a stored stream's planes make; they are computed when they are read."""
+
+    read: Read | None = None
+
+    def _read(self, start: int, stop: int, crop: Crop | None) -> Array:
+        assert self.read is not None
+        self._existing(start, stop)
+        codes = self.read(start, stop)
+        if crop is None:
+            return codes
+        y, x, height, width = crop
+        return codes[:, y : y + height, x : x + width]
+
+
+def summed(stream: Stream, sums: PlaneSums) -> Stream:
+    """Return the codes that sums of a stream's planes make; the same stream if nothing is asked.
+
+    Its truth is known where its codes follow each other from the first plane on. `ArgumentError` for frames that do not
+    exist, and for planes that this sensor does not sum. `ValueError` for a stream whose codes have exposures or rows of
+    their own times.
+    """
+    if not sums.any:
+        return stream
+    stream.require_even("a sum of planes")
+    taken = sums.over(len(stream), str(stream.path), bits=stream.bits)
+    return SummedStream(stream.path, _described(stream, taken), stream.keeps, taken.of(stream.codes))
+
+
 def sum_planes(
     stream: Stream, sums: PlaneSums, path: Path, *, force: bool = False, progress: Progress | None = None
 ) -> Stream:
-    """Write the codes that sums of a stream's planes make as PATH.npy and PATH.json; return them.
-
-    `ArgumentError` for frames that do not exist, and for planes that this sensor does not sum. `ValueError` for a
-    stream whose codes have exposures or rows of their own times.
-    """
-    stream.require_even("a sum of planes")
+    """Write the codes that sums of a stream's planes make as PATH.npy and PATH.json; return them. Errors: `summed`."""
+    made = summed(stream, sums)
     npy = free_stream(path, force)
+    info = replace(made.info, clip="", planes_of=stream.info.planes_of or stream.info.clip)
+    codes, height, width = made.shape
+    npy.parent.mkdir(parents=True, exist_ok=True)
+    step = max(1, _TOGETHER // (height * width))
+
+    def packed() -> Iterator[Array]:
+        for start in range(0, codes, step):
+            stop = min(start + step, codes)
+            yield packing.pack(made.codes(start, stop), made.bits)
+            if progress is not None:
+                progress(stop, codes)
+
+    return write_packed(npy, packed(), info)
+
+
+def _described(stream: Stream, taken: Sums) -> StreamInfo:
+    """Return the description of the codes that are made of a stream."""
     info = stream.info
-    length, height, width = stream.shape
-    taken = sums.over(length, str(stream.path), bits=stream.bits)
+    _, height, width = stream.shape
     sensor = stream.sensor
     if taken.planes > 1:
         if not sensor.sums_planes:
@@ -48,7 +92,8 @@ def sum_planes(
         light = StreamLight(
             factor=light.factor, ppp=light.ppp * taken.planes, before=light.before * taken.planes, lux=light.lux
         )
-    made = StreamInfo.of(
+    chosen = taken.codes != len(stream) or taken.planes > 1
+    return StreamInfo.of(
         sensor,
         sensor_name=info.sensor_name,
         shape=(taken.codes, height, width),
@@ -61,21 +106,10 @@ def sum_planes(
         colour=info.colour,
         origin=info.origin,
         temperature=info.temperature,
+        clip=info.clip,
         light=light,
-        planes_of=info.planes_of or info.clip,
+        planes_of=info.planes_of,
         orientation=info.orientation,
         source=info.source,
-        times=None if info.times is None else taken.times(info.frame_rate, info.times),
+        times=taken.times(info.frame_rate, info.times) if chosen else info.times,
     )
-    npy.parent.mkdir(parents=True, exist_ok=True)
-    read = taken.of(stream.codes)
-    step = max(1, _TOGETHER // (height * width))
-
-    def packed() -> Iterator[Array]:
-        for start in range(0, taken.codes, step):
-            stop = min(start + step, taken.codes)
-            yield packing.pack(read(start, stop), sensor.bits)
-            if progress is not None:
-                progress(stop, taken.codes)
-
-    return write_packed(npy, packed(), made)

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsim import colour, files
-from qsim.checks import check_shape, check_video
+from qsim.checks import ArgumentError, check_shape, check_video
 from qsim.colour import bright_end
 from qsim.files import load_array
 from qsim.formats.recording import checked_codes
-from qsim.plane_sums import AS_STORED, PlaneSums
+from qsim.plane_sums import AS_STORED, PlaneSums, within_sum
 from qsim.restored_video import Restored, RestoredInfo, describes_restored
 from qsim.sensor import packing
 from qsim.sensor.demosaicing import demosaic, determines_bands
@@ -154,9 +154,11 @@ def _stream_source(stream: Stream, sums: PlaneSums = AS_STORED) -> Source:
         views = _code_views(stream.name, top, len(stream), stream.codes, bands)
         return Source(stream.name, len(stream), rate, views, stream.rates)
     taken = sums.over(len(stream), str(stream.path), bits=stream.bits)
+    of_planes = taken if stream.sums is None else taken.within(stream.sums)
     top = taken.planes if taken.planes > 1 else stream.sensor.levels - 1
     views = _code_views(stream.name, top, taken.codes, taken.of(stream.codes), bands)
-    return Source(stream.name, taken.codes, rate / taken.step, views, taken.words(rate))
+    rates = of_planes.words(rate / taken.step * of_planes.step)
+    return Source(stream.name, taken.codes, rate / taken.step, views, rates)
 
 
 def _array_source(
@@ -183,6 +185,9 @@ def _array_source(
         return _packed_source(path, array, width, sums)
     if bits is None and (sums.planes or 1) > 1:
         bits = 1
+    if sums.summed is not None:
+        _refuse(path, "said to hold sums of planes (summed=)", bits=bits)
+        bits = sums.summed.bit_length()
     if bits is None:
         raise ValueError(f"{path}: whole numbers are codes or packed planes; add bits=3, or width=320 for planes")
     if not 1 <= bits <= 16:
@@ -198,10 +203,13 @@ def _bare_source(
     path: Path, bits: int, length: int, read: Callable[[int, int], NDArray[Any]], sums: PlaneSums
 ) -> Source:
     """Return the views of codes of these bits in a bare array, or of sums of them."""
-    taken = sums.over(length, str(path), bits=bits)
-    top = taken.planes if taken.planes > 1 else 2**bits - 1
+    taken = sums.over(length, str(path), bits=bits, bare=True)
+    of_planes = taken.within(sums.stored(length))
+    if sums.summed is not None:
+        read = within_sum(read, sums.summed, str(path))
+    top = of_planes.planes if of_planes.planes > 1 else 2**bits - 1
     views = _code_views(path.stem, top, taken.codes, taken.of(read))
-    return Source(path.stem, taken.codes, None, views, taken.words(None) if sums.any else "")
+    return Source(path.stem, taken.codes, None, views, of_planes.words(None) if sums.any else "")
 
 
 def _packed_source(path: Path, array: NDArray[Any], width: int, sums: PlaneSums) -> Source:
@@ -214,6 +222,8 @@ def _packed_source(path: Path, array: NDArray[Any], width: int, sums: PlaneSums)
     def read(start: int, stop: int) -> NDArray[Any]:
         return packing.unpack(np.asarray(array[start:stop]), 1, width)
 
+    if sums.summed is not None:
+        raise ArgumentError("summed", f"{path}: packed planes (width=) are single ones; leave it out")
     return _bare_source(path, 1, len(array), read, sums)
 
 

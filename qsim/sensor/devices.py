@@ -286,11 +286,12 @@ def load_sum(
     bits: int | None = None,
     ppp: float | None = None,
     exposure: float = 5e-4,
+    argument: str = "planes",
 ) -> Sensor:
     """Return the sensor of codes that sum so many planes, each of `exposure` [s]; else as `load`.
 
-    `bits` may be those of a plane or of the sum, and so may those of a file. `ValueError` for others, and for a sensor
-    that sums no planes.
+    `bits` may be those of a plane or of the sum, and so may those of a file. `ValueError` for others, and with the
+    `argument` that states the planes for a sensor that sums none.
     """
     loaded = load(name, ppp=ppp, bits=plane_bits(name, planes, bits), exposure=exposure)
     if planes == 1:
@@ -299,7 +300,7 @@ def load_sum(
         kind = type(loaded).__name__
         shown = kind if isinstance(name, Sensor) else name
         raise ArgumentError(
-            "planes",
+            argument,
             f"{shown}: only a clocked SPAD sums planes, this is a {kind}; give another sensor, as in spad-320x240",
         )
     return loaded.plane.of_planes(planes)

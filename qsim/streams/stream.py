@@ -166,9 +166,9 @@ class Stream:
 
     @property
     def sums(self) -> Sums | None:
-        """The planes behind the codes, if they are sums of planes; else None."""
+        """The planes behind the codes, if they are sums of planes, or some of all planes; else None."""
         planes = self.info.planes_per_code
-        if planes == 1 or not self.sensor.sums_planes:
+        if (planes == 1 and self.info.plane_rate is None) or not self.sensor.sums_planes:
             return None
         rate = self.info.plane_rate or self.info.frame_rate * planes
         return Sums(planes, 0, round(rate / self.info.frame_rate), len(self))

@@ -46,7 +46,7 @@ IDLE = (
     ),
     Idle(
         lambda asked, *_: "" if asked.static else "belongs to --static COUNTS",
-        ("frames", "splits", "width", "start", "stop", "every"),
+        ("frames", "splits", "width", "start", "stop", "every", "summed"),
     ),
     Idle(
         lambda asked, *_: f"--protocol {asked.protocol} decides it" if asked.protocol else "",
@@ -62,7 +62,7 @@ IDLE = (
     ),
     Idle(
         lambda asked, *_: f"stream {asked.stream} is stored and has its own" if asked.stream else "",
-        ("sensor", "ppp", "bits", "planes", "seed"),
+        ("sensor", "ppp", "bits", "seed"),
     ),
     Idle(
         lambda asked, *_: (
@@ -169,13 +169,17 @@ def _comparison(asked: EvaluateSettings, planes: int | None) -> Comparison:
         return _published_test(asked)
     sensor = asked.sensor or ("quiver-published" if asked.published else "quiver-physical")
     own = sensor.endswith(".toml")  # the file states the bits
+    over = None if asked.stream else planes
     lights = tuple(
-        Illumination.of(sensor, ppp, bits).over(planes, bits if asked.bits else None)
+        Illumination.of(sensor, ppp, bits).over(over, bits if asked.bits else None)
         for bits in asked.bits or ((None,) if own else (3,))
         for ppp in asked.ppp or (3.25,)
     )
     split = None if asked.split == "all" else asked.split or "test"
-    return Comparison(asked.named, split, lights, asked.seed or 0, asked.published, asked.stream, asked.peak)
+    summed = planes if asked.stream else None
+    return Comparison(
+        asked.named, split, lights, asked.seed or 0, asked.published, asked.stream, asked.peak, planes=summed
+    )
 
 
 def _check_source(asked: EvaluateSettings) -> None:
@@ -221,8 +225,8 @@ def _run_static(asked: EvaluateSettings, sums: PlaneSums, methods: Sequence[Any]
         raise FileNotFoundError(f"{asked.static}: no such file")
     planes = sums.any or asked.width is not None
     counts = read_planes(asked.static, sums, asked.width) if planes else read_counts(asked.static)
-    if planes and asked.bits is not None:
-        raise ArgumentError("bits", f"sums of {sums.planes or 1} planes are not clipped; leave it out")
+    if counts.sums is not None and asked.bits is not None:
+        raise ArgumentError("bits", f"sums of {counts.sums.planes} planes are not clipped; leave it out")
     bits = (asked.bits or (3,))[0] if counts.sums is None else counts.sums.bits
     frames = asked.frames or 11
     check_domain(asked, methods, [counted(counts, bits)])

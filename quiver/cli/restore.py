@@ -81,7 +81,7 @@ def _restore_cubes(asked: RestoreSettings, sums: PlaneSums, options: RestoreOpti
     target: Path = asked.output
     idle = ("stream", "sensor", "ppp", "bits", "seed", "width", "frame_rate", "defects", "scan")
     refuse(asked, idle, f"{target} is a submission, whose layout states it")
-    refuse(sums, ("start", "stop", "every"), "the challenge scores the last plane of all that a cube has")
+    refuse(sums, ("start", "stop", "every", "summed"), "the challenge scores the last plane of all that a cube has")
     check_target(target, asked.force)
     found = cubes(asked.source)
     planes = sums.planes or 1

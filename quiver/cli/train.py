@@ -70,7 +70,9 @@ def train(asked: Train, given: Annotated[dict[str, Any], Settings]) -> int:
         settings = _of_stream(given, settings)
     elif "scan" in given:
         raise ArgumentError(
-            "scan", "acts on a recording that a network learns from; the defects of drawn codes are known; leave it out"
+            "scan",
+            "acts on a recording that a network learns from; the defects of drawn codes are known; leave it out",
+            off=given["scan"] is False,
         )
     if "validate_every" in given and settings.steps is None:
         raise ValueError(

@@ -23,6 +23,7 @@ from qsim.arrays import plain
 from qsim.checks import ArgumentError
 from qsim.clip.lazy_array import LazyArray
 from qsim.files import read_json, sha256, to_json, wording
+from qsim.formats import summing
 from qsim.frame_times import Times
 from qsim.keys import Key, hash_name
 from qsim.plane_sums import PlaneSums, Sums
@@ -164,14 +165,16 @@ def filled(codes: Codes, bad: Array | None) -> Codes:
 def summed(codes: Codes, asked: PlaneSums) -> Codes:
     """Return the codes that sums of a recording's planes make (plane_sums.py); the same if nothing is asked.
 
-    Defective pixels are filled in the sums. `ArgumentError` for frames that do not exist, and for planes that this
-    sensor does not sum.
+    Of codes that are sums already, and of exposures that take turns, some are chosen. Defective pixels are filled in
+    the sums. `ArgumentError` for frames that do not exist, and for planes that this sensor does not sum.
     """
     if not asked.any:
         return codes
     if codes.unfilled is not None:
         return filled(summed(codes.unfilled, asked), codes.defective)
     length, height, width = codes.shape
+    if (asked.planes or 1) > 1 and codes.sums is not None and codes.sums.planes > 1:
+        raise ArgumentError("planes", f"{codes.name} has sums of {codes.sums.planes} planes already; leave it out")
     sums = asked.over(length, codes.name, bits=codes.sensor.bits)
     sensor = codes.sensor
     if sums.planes > 1:
@@ -182,10 +185,12 @@ def summed(codes: Codes, asked: PlaneSums) -> Codes:
                 f"{codes.sensor_name or kind}: only a clocked SPAD sums planes, this is a {kind}; give another sensor, "
                 "as in spad-320x240",
             )
+        if codes.shares is not None:
+            raise ArgumentError("planes", f"{codes.name} has exposures that take turns; leave it out")
         sensor = sensor.of_planes(sums.planes)
-    if codes.shares is not None or (codes.sums is not None and codes.sums.planes > 1):
-        what = "exposures that take turns" if codes.shares is not None else "sums of planes already"
-        raise ArgumentError("planes", f"{codes.name} has {what}; leave it out")
+    turns = codes.shares
+    if turns is not None:
+        turns = tuple(turns[(sums.start + n * sums.step) % len(turns)] for n in range(len(turns)))
     plane_rate = codes.frame_rate
 
     def digest() -> str:
@@ -201,7 +206,8 @@ def summed(codes: Codes, asked: PlaneSums) -> Codes:
         read=sums.of(codes.read),
         digest=digest,
         ppp=None if codes.ppp is None else codes.ppp * sums.planes,
-        sums=sums,
+        shares=turns,
+        sums=sums if codes.sums is None else sums.within(codes.sums),
         times=sums.times(plane_rate, codes.times),
     )
 
@@ -265,16 +271,18 @@ def array_digest(array: Array) -> str:
 
 
 def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "codes", source: str = "memory") -> Codes:
-    """Return codes [T, H, W] in memory or in a memory map. `ValueError` if empty, or for codes that the sensor cannot
-    produce.
+    """Return codes [T, H, W] in memory or in a memory map; truth values are codes of 0 and 1. `ValueError` if empty, or
+    for codes that the sensor cannot produce.
     """
-    if codes.ndim != 3 or codes.size == 0 or not np.issubdtype(codes.dtype, np.integer):
+    if codes.ndim != 3 or codes.size == 0 or codes.dtype.kind not in "iub":
         raise ValueError(
-            f"{name}: expected integer codes [T, H, W] without an empty axis, got {codes.dtype} {codes.shape}"
+            f"{name}: expected whole codes [T, H, W] without an empty axis, got {codes.dtype} {codes.shape}"
         )
 
     def read(start: int, stop: int) -> Array:
         part = plain(codes[start:stop])
+        if part.dtype == np.bool_:
+            return part.view(np.uint8)
         if part.max() >= sensor.levels or part.min() < 0:
             t, y, x = (int(i) for i in np.argwhere((part < 0) | (part >= sensor.levels))[0])
             raise ValueError(
@@ -320,6 +328,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, CodeT
         sensor_name=light.sensor,
         ppp=draw.level.ppp * draw.planes,
         shares=draw.timing.shares,
+        sums=Sums(draw.planes, 0, draw.planes, len(truth)) if draw.timing.summed and draw.planes > 1 else None,
         colour=draw.colour,
         not_inverted=_not_inverted(vars(draw.defects) if draw.defects else {}),
     )
@@ -390,13 +399,17 @@ def open_stream(path: Path) -> Stream:
     return Stream.open(path.with_suffix(".json"))
 
 
-def stored(clip: Clip, name: str) -> tuple[Codes, CodeTruth]:
-    """Return a stored stream of a clip and its truth; `ValueError` for codes of another clip."""
+def stored(clip: Clip, name: str, planes: int | None = None) -> tuple[Codes, CodeTruth]:
+    """Return a stored stream of a clip, of which so many planes are summed to a code, and its truth.
+
+    `ValueError` for codes of another clip, and for planes that are not those of a clocked SPAD.
+    """
+    asked = PlaneSums(planes=planes)
     stream = clip.stream(name)
-    truth = stream.code_truth
-    if stream.info.planes_of or stream.shape != (len(truth), *clip.shape[1:]):
+    truth = summing.summed(stream, asked).code_truth
+    if stream.info.planes_of or stream.shape != (len(stream.code_truth), *clip.shape[1:]):
         raise ValueError(f"{stream.path}: its codes are not those of its clip, so their truth is not known")
-    return stream_codes(stream), truth
+    return summed(stream_codes(stream), asked), truth
 
 
 def check_published(light: Illumination) -> None:

@@ -26,10 +26,12 @@ from typing import Annotated
 
 import numpy as np
 from numpy import ndarray as Array
+from scipy.fft import dct
 from scipy.ndimage import correlate1d, uniform_filter, uniform_filter1d
 from scipy.stats import chi2
 
 from qsim.checks import ArgumentError
+from qsim.sensor.estimation import Response
 from qsim.settings import setting
 from quiver.data.codes import Codes, filled
 
@@ -50,6 +52,14 @@ MANY = 3.0  # of what their share explains where nothing moves: more than this a
 SURE = 3.0  # deviations
 LEAST = 1e-3  # variance of a code [codes^2], at least
 SLACK = 1.25  # on the part of a change that light in common explains
+FEW_PIXELS = 28  # of such a side; with FEW_COUNTS in them at a time, or less, light is little
+FEW_COUNTS = 300
+NEAR = 5  # px, side of the square of neighbours in little light
+WIDE_SIDE = (7, 6)  # px, width and depth of what is compared there
+WIDE = 15  # px, side of the square over which motion is averaged
+AWAY = 10  # px, from a pixel to the middle of that square on each of its sides
+SLOW = 5  # half periods in a clip, up to which changes count
+MOVED = 2.0  # of what noise gives, in each of these squares
 SIDES = ((3, 2), (7, 4))  # px, width and depth of what is compared on each side of a pixel
 AROUND = 9  # px, side of the square of neighbours whose excess is the measure
 
@@ -82,6 +92,7 @@ def scanned(codes: Codes, wanted: bool | None = None) -> Codes:
             raise ArgumentError(
                 "scan",
                 f"acts on recordings without a map of hot pixels, and those of {codes.name} are known; leave it out",
+                off=not wanted,
             )
         return codes
     if wanted is False:
@@ -114,7 +125,7 @@ def scan(codes: Codes) -> Scan:
     for i in range(rows):
         for j in range(columns):
             place = (slice(i, None, rows), slice(j, None, columns))
-            seen = _Seen.of(means[:, *place], response.mean, response.variance, each)
+            seen = _Seen.of(means[:, *place], response, each)
             proven[place] = seen.proven
             hot[place] = seen.hot
             moving[place] = seen.moving
@@ -132,8 +143,10 @@ class _Seen:
     followed: Array  # [3, H, W]: changes that it shares with its neighbours; those of its neighbours; noise in them
 
     @classmethod
-    def of(cls, means: Array, mean_code: Array, variance: Array, frames: int) -> _Seen:
-        """Return what mean codes [K, H, W] of `frames` codes each tell, by the variances of a code at a mean code."""
+    def of(cls, means: Array, response: Response, frames: int) -> _Seen:
+        """Return what mean codes [K, H, W] of `frames` codes each tell, by the response of a good pixel."""
+        mean_code = response.mean
+        variance = response.variance
         ring = _ring(means)
         least = LEAST / frames
         typical = np.maximum(uniform_filter(means.mean(axis=0), 3, mode="reflect"), ring)  # of few counts a median errs
@@ -148,12 +161,16 @@ class _Seen:
         dark_enough = ring < 0.85 * mean_code[-1]  # beside saturated neighbours no excess is left
         low = excess < CONSTANT * mean_excess - 3 * np.sqrt(own + beside)
         bright = stands_out & ~(low & dark_enough).any(axis=0)
+        clean, near, pixels = _without(means, stands_out)
+        clean_noise = np.interp(near.mean(axis=0), mean_code, variance) / frames + least
+        little = near.mean(axis=0) * frames * FEW_PIXELS < FEW_COUNTS
+        around = np.where(little, near, ring)
         return cls(
             stands_out,
             bright,
-            _moving(means, ring, own),
+            _moving(means, ring, own) | (little & _moving_in_little_light(clean, clean_noise)),
             ~_follows(means, ring, own, beside),
-            _shared(means, ring, own, beside),
+            _shared(means, around, own, np.where(little, clean_noise / pixels, beside), response),
         )
 
     @property
@@ -199,6 +216,53 @@ def _ring(means: Array) -> Array:
         if (dy, dx) != (0, 0)
     ]
     return np.asarray(np.median(np.stack(near), axis=0))
+
+
+def _without(means: Array, out: Array) -> tuple[Array, Array, Array]:
+    """Return means [K, H, W] with the mean of the neighbours at pixels that stand out; that mean, and of how many.
+
+    Of few counts the mean of many neighbours tells more than the median of eight.
+    """
+    good = (~out).astype(float)
+    pixels = np.maximum(_box(good, NEAR) - good, 1.0)
+    near = (_box(means * good, NEAR) - means * good) / pixels
+    return np.where(out, near, means), near, pixels
+
+
+def _box(values: Array, size: int) -> Array:
+    """Return the sums [..., H, W] of squares of `size` pixels around each pixel."""
+    sizes = (1,) * (values.ndim - 2) + (size, size)
+    return np.asarray(uniform_filter(values, sizes, mode="reflect") * size**2)
+
+
+def _moving_in_little_light(means: Array, noise: Array) -> Array:
+    """Return where light moves, bool [H, W], of means [K, H, W] of a few counts, without pixels that stand out.
+
+    No place tells that alone. So the differences of opposite sides, slow changes only, are squared in units of their
+    noise: 1 on average where nothing moves. They are averaged over a square on each of the four sides of a pixel, and
+    all of them must have moved. Changes that the neighbourhood shares are taken off.
+    """
+    width, depth = WIDE_SIDE
+    level = _box(means, WIDE) / WIDE**2
+    change = level - level.mean(axis=0)
+    squares = np.zeros(means.shape[1:])
+    for one, other in (((-1, 0), (1, 0)), ((0, -1), (0, 1))):
+        sides = [_side(means, *side, width, depth) for side in (one, other)]
+        beside = sum(_side(noise[None], *side, width, depth)[0] for side in (one, other)) / (width * depth)
+        middle = (sides[0] - sides[1]).mean(axis=0)
+        left = sides[0] - sides[1] - middle
+        most = SLACK * np.abs(middle) / np.maximum(level.mean(axis=0), 1e-6)
+        slope = np.clip((change * left).sum(axis=0) / np.maximum((change**2).sum(axis=0), 1e-12), -most, most)
+        slow = dct(left - slope * change, axis=0, norm="ortho")[1 : SLOW + 1]
+        squares += (slow**2).mean(axis=0) / beside / 2
+    pooled = _box(squares, WIDE) / WIDE**2
+    far = np.pad(pooled, AWAY, mode="reflect")
+    height, width = pooled.shape
+    sides_of = [
+        far[AWAY + dy : AWAY + dy + height, AWAY + dx : AWAY + dx + width]
+        for dy, dx in ((-AWAY, 0), (AWAY, 0), (0, -AWAY), (0, AWAY))
+    ]
+    return np.asarray(np.minimum.reduce(sides_of) > MOVED)
 
 
 def _robust_square(values: Array) -> Array:
@@ -268,15 +332,19 @@ def _follows(means: Array, ring: Array, own: Array, beside: Array) -> Array:
     return np.asarray(left < chi2.isf(CHANGED, len(means) - 1))
 
 
-def _shared(means: Array, ring: Array, own: Array, beside: Array) -> Array:
+def _shared(means: Array, ring: Array, own: Array, beside: Array, response: Response) -> Array:
     """Return what each pixel has of the changes of its neighbours' light, in units of its noise, [3, H, W].
 
     They are the sums over time of change times change, of the neighbours' change squared, and of the noise in that.
-    Neighbours are scaled to the light of the pixel.
+    Neighbours are scaled to the light of the pixel, whose codes change less the nearer they are to the top.
     """
-    ratio = means.mean(axis=0) / np.maximum(ring.mean(axis=0), 1e-6)
-    expected = ratio * (ring - ring.mean(axis=0))
-    change = means - means.mean(axis=0)
+    rise = np.gradient(response.mean, response.photons)
+    levels = means.mean(axis=0), ring.mean(axis=0)
+    light, around = (np.interp(level, response.mean, response.photons) for level in levels)
+    slope, slope_around = (np.interp(level, response.mean, rise) for level in levels)
+    ratio = light / np.maximum(around, 1e-6) * slope / np.maximum(slope_around, 1e-12)
+    expected = ratio * (ring - levels[1])
+    change = means - levels[0]
     shared = (change * expected).sum(axis=0)
     noise = (1 - 1 / len(means)) * (ratio**2 * beside).sum(axis=0)
     return np.stack([shared, (expected**2).sum(axis=0), noise]) / own

@@ -50,16 +50,18 @@ def arrivals(mean: Array, planes: int, frames: int) -> Array:
 def read_planes(path: Path, sums: PlaneSums, width: int | None) -> Counts:
     """Return sums of the binary planes of a static object, of an ideal clocked SPAD: of a stream, or of a .npy.
 
-    A .npy holds planes of 0 and 1, [T, H, W], or with `width` packed ones, [T, H, ceil(W/8)]. The share of a frame is
+    A .npy holds planes of 0 and 1, [T, H, W], sums of planes as `sums` states, or with `width` packed planes,
+    [T, H, ceil(W/8)]. The share of a frame is
     its light over that of the mean frame, to first order. `ValueError` for values of several bits.
     """
     if path.with_suffix(".json").is_file() and path.suffix in (".npy", ".json"):
         if width is not None:
             raise ArgumentError("width", f"{path} is a stored stream, which has its own (see its .json); leave it out")
         codes = summed(codes_of(open_stream(path)), sums)
-        rate = codes.frame_rate * (sums.every or sums.planes or 1)
+        rate = codes.frame_rate * (1 if codes.sums is None else codes.sums.step)
     else:
-        codes = cube_codes(path, Illumination(Sensing(ideal_clocked())), 1.0, sums=sums, width=width)
+        sensor = ideal_clocked(sums.summed or 1)
+        codes = cube_codes(path, Illumination(Sensing(sensor)), 1.0, sums=sums, width=width)
         rate = None
     if not codes.sensor.sums_planes:
         raise ValueError(f"{path}: holds codes of a {type(codes.sensor).__name__}, and planes are those of a SPAD")

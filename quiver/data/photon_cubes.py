@@ -9,6 +9,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.arrays import plain
+from qsim.checks import ArgumentError
 from qsim.files import load_array
 from qsim.plane_sums import AS_STORED, PlaneSums
 from qsim.sensor import devices
@@ -22,12 +23,15 @@ def cube_codes(
 ) -> Codes:
     """Return the codes of a bare .npy: integers [T, H, W], or with `width` binary planes [T, H, ceil(W/8)].
 
-    The first pixel of a packed byte is its highest bit. `frame_rate` counts the frames of the file per second: planes,
-    if they are summed. `ValueError` where these do not fit together.
+    The first pixel of a packed byte is its highest bit. `frame_rate` counts the frames of the
+    file per second: planes, if they are summed here, and codes, if the camera has summed them (`sums.summed`).
+    `ValueError` where these do not fit together.
     """
     array = load_array(path)
     planes = sums.planes or 1
-    if width is None and planes == 1:
+    if sums.summed is not None:
+        codes = _of_sums(path, array, light, frame_rate, sums, width)
+    elif width is None and planes == 1:
         codes = array_codes(array, light.device(1 / frame_rate), 1 / frame_rate, path.name, str(path))
     else:
         sensor = _plane_of(light, planes, 1 / frame_rate)
@@ -37,7 +41,21 @@ def cube_codes(
         else:
             codes = _unpacked(path, array, sensor, frame_rate, width)
     codes = replace(codes, digest=lambda: array_digest(array), sensor_name=light.sensor, unmapped=True)
-    return summed(codes, sums)
+    return summed(codes, replace(sums, summed=None))
+
+
+def _of_sums(
+    path: Path, array: Array, light: Illumination, frame_rate: float, sums: PlaneSums, width: int | None
+) -> Codes:
+    """Return the codes of a bare array that are sums of planes already; `ArgumentError` for packed planes."""
+    if width is not None:
+        raise ArgumentError("summed", f"{path}: packed planes (width=) are single ones; leave it out")
+    planes = sums.summed or 1
+    seconds = 1 / (frame_rate * planes)
+    named = light.sensing.sensor
+    sensor = devices.load_sum(named, planes, bits=light.bits, ppp=light.ppp, exposure=seconds, argument="summed")
+    codes = array_codes(array, sensor, 1 / frame_rate, path.name, str(path))
+    return replace(codes, sums=sums.stored(len(array)) if planes > 1 else None)
 
 
 def _plane_of(light: Illumination, planes: int, exposure: float) -> Sensor:

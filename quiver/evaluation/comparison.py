@@ -55,18 +55,21 @@ class Comparison:
     stream: str | None = None  # score this stored stream instead of sensing at `lights`
     peak: float | None = None  # of the scores, photons per pixel; None = 2.5 x mean light (published: sensor's white)
     test_set: str | None = None  # of the paper, in its own layout: the truth is grey / 255, its peak 1
+    planes: int | None = None  # of the stored stream, which are summed to a code; None = its codes as they are
 
     def __post_init__(self) -> None:
         labels(self.lights)  # `ValueError` where two would have one name
 
     def label(self, light: Illumination) -> str:
         """Return the text of tables of one of the lights, or of the stored stream."""
-        return self.stream or labels(self.lights)[light]
+        if self.stream is not None:
+            return self.stream if self.planes is None else f"{self.stream}, {self.planes} planes"
+        return labels(self.lights)[light]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
-        return plain if self.test_set else {name: v for name, v in plain.items() if name != "test_set"}
+        return {name: v for name, v in plain.items() if v is not None or name not in ("test_set", "planes")}
 
 
 def scored_frames(length: int, published: bool) -> range:
@@ -258,9 +261,7 @@ def evaluate(
     total = len(comparison.lights) * len(clips) * len(methods)
     for light in comparison.lights:
         for clip in clips:
-            drawn, truth = (
-                sensed(clip, light, comparison.seed) if comparison.stream is None else stored(clip, comparison.stream)
-            )
+            drawn, truth = _codes(comparison, clip, light)
             label = comparison.label(light)
             codes: Codes | None = None
             for method in methods:
@@ -283,9 +284,14 @@ def streams(comparison: Comparison) -> Iterator[Codes]:
     """Yield every stream of a comparison before anything is drawn; errors as `evaluate`."""
     for light in comparison.lights:
         for clip in clips_of(comparison):
-            yield (
-                sensed(clip, light, comparison.seed) if comparison.stream is None else stored(clip, comparison.stream)
-            )[0]
+            yield _codes(comparison, clip, light)[0]
+
+
+def _codes(comparison: Comparison, clip: Clip, light: Illumination) -> tuple[Codes, CodeTruth]:
+    """Return the scored codes of a clip and their truth."""
+    if comparison.stream is None:
+        return sensed(clip, light, comparison.seed)
+    return stored(clip, comparison.stream, comparison.planes)
 
 
 def in_memory(codes: Codes) -> Codes:

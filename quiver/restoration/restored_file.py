@@ -41,6 +41,7 @@ WHAT_CHANGED = {  # key of the description -> its name in the message that a res
     "sensor": "the sensor",
     "shape": "the shape",
     "times": "the planes",
+    "planes": "the planes",
     "source": "the source",
     "quiver": "the program's version",
 }
@@ -130,6 +131,7 @@ def _described(codes: Codes, method: Restorer) -> VideoInfo:
         frame_rate=codes.frame_rate,
         plane_rate=None if codes.sums is None else codes.frame_rate * codes.sums.step,
         planes_per_code=1 if codes.sums is None else codes.sums.planes,
+        planes=None if codes.sums is None else codes.sums.range,
         times=codes.times,
         exposure=codes.exposure,
         sensor=codes.sensor.to_dict(),

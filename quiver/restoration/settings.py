@@ -52,10 +52,11 @@ class RestoreSettings:
         Text | None,
         setting("a name of `qsim sensors`, or a .toml file", unset="quiver-physical", known=sensor_names),
     ] = None
-    ppp: Annotated[Light | None, setting("mean photons per pixel and exposure", unset="that of the stored stream")] = (
-        None
-    )
-    bits: Annotated[Bits | None, setting("bits per code", unset="3; of a .toml file its own")] = None
+    ppp: Annotated[
+        Light | None,
+        setting("mean photons per pixel and code, with --planes of the sum", unset="that of the stored stream"),
+    ] = None
+    bits: Annotated[Bits | None, setting("bits per code", unset="3; of a .toml file its own, of truth values 1")] = None
     seed: Annotated[Seed | None, setting("seed of the noise, if a clip is sensed now", unset="0")] = None
     width: Annotated[Whole | None, setting("bare array: packed binary planes of this many pixels per row")] = None
     frame_rate: Annotated[

@@ -10,7 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from qsim.checks import ArgumentError
+from qsim.files import load_array
 from qsim.plane_sums import AS_STORED, PlaneSums
 from quiver.data.clips import Clip, open_clips
 from quiver.data.codes import Codes, codes_of, filled, light_of, open_stream, repaired, sensed, stream_codes, summed
@@ -35,7 +38,7 @@ def refuse(asked: Any, names: Sequence[str], why: str) -> None:
     for name in names:
         value = getattr(asked, name)
         if value is not None and (value is not False or name == "scan"):  # 0 is a given value
-            raise ArgumentError(name, f"{why}; leave it out")
+            raise ArgumentError(name, f"{why}; leave it out", off=value is False)
 
 
 def refuse_idle(asked: Mapping[str, Any], methods: Sequence[Restorer]) -> None:
@@ -75,7 +78,7 @@ def codes_to_restore(asked: RestoreSettings, sums: PlaneSums = AS_STORED) -> Cod
 def _found(asked: RestoreSettings, sums: PlaneSums) -> Codes:
     path: Path = asked.source
     if path.is_dir():
-        return summed(_of_clip(path, asked), sums)
+        return _of_clip(path, asked, sums)
     if path.with_name(f"{path.name}.part").is_dir() and not path.exists():
         open_clips(path)  # raises: the clip is unfinished
     if not path.is_file():
@@ -90,7 +93,7 @@ def _found(asked: RestoreSettings, sums: PlaneSums) -> Codes:
     return _of_array(path, asked, sums)
 
 
-def _of_clip(path: Path, asked: RestoreSettings) -> Codes:
+def _of_clip(path: Path, asked: RestoreSettings, sums: PlaneSums) -> Codes:
     clips = open_clips(path)
     if not (path / "clip.json").exists():
         one = f", as in {clips[0].path}" if clips else "; none is finished yet"
@@ -104,8 +107,23 @@ def _of_clip(path: Path, asked: RestoreSettings) -> Codes:
         stream = clip.stream(asked.stream or clip.streams[0])
         now = "" if asked.stream else " (with ppp= the clip is sensed again)"
         refuse(asked, LIGHT, f"{stream.path} is a stored stream, which has its own{now}")
-        return stream_codes(stream)
-    return sensed(clip, Illumination.of(_sensor(asked), asked.ppp, _bits(asked)), asked.seed or 0)[0]
+        return summed(stream_codes(stream), sums)
+    depth = asked.bits if sums.planes else _bits(asked)
+    light = Illumination.of(_sensor(asked), asked.ppp, depth).over(sums.planes, asked.bits)
+    return _chosen(sensed(clip, light, asked.seed or 0)[0], clip, light.planes, sums)
+
+
+def _chosen(codes: Codes, clip: Clip, planes: int, sums: PlaneSums) -> Codes:
+    """Return those codes of so many clip frames each that begin where `sums` says, in clip frames."""
+    sums.over(len(clip), str(clip.path))  # raises: the clip has no such frames
+    for name, value in (("start", sums.start), ("every", sums.every)):
+        if value is not None and value % planes:
+            raise ArgumentError(
+                name, f"{value}: codes of {planes} frames of a clip begin at multiples of {planes}; give one of them"
+            )
+    stop = None if sums.stop is None else sums.stop // planes
+    every = None if sums.every is None else sums.every // planes
+    return summed(codes, PlaneSums((sums.start or 0) // planes or None, stop, every, summed=sums.summed))
 
 
 def _of_array(path: Path, asked: RestoreSettings, sums: PlaneSums) -> Codes:
@@ -113,8 +131,8 @@ def _of_array(path: Path, asked: RestoreSettings, sums: PlaneSums) -> Codes:
     refuse(asked, ["seed"], f"is for noise that is drawn, and {path} holds codes already")
     if not follows_light(sensor):
         refuse(asked, ["ppp"], f"{path} holds codes already, and the gain of {sensor} does not follow the light")
-    planes = asked.width is not None or (sums.planes or 1) > 1
-    light = Illumination.of(sensor, asked.ppp, asked.bits if planes else _bits(asked))
+    planes = asked.width is not None or (sums.planes or 1) > 1 or sums.summed is not None
+    light = Illumination.of(sensor, asked.ppp, asked.bits if planes else _bits(asked, _least_bits(path)))
     if asked.output.resolve() == path.resolve():
         raise ValueError(f"{path}: would be replaced by what is made from it; name another")
     codes = cube_codes(path, light, asked.frame_rate or FRAME_RATE, sums=sums, width=asked.width)
@@ -127,9 +145,14 @@ def _sensor(asked: RestoreSettings) -> str:
     return asked.sensor or "quiver-physical"
 
 
-def _bits(asked: RestoreSettings) -> int | None:
-    """Return the bits per code: as given, else those of a sensor's file, else 3."""
-    return asked.bits or (None if _sensor(asked).endswith(".toml") else 3)
+def _bits(asked: RestoreSettings, otherwise: int = 3) -> int | None:
+    """Return the bits per code: as given, else those of a sensor's file, else these."""
+    return asked.bits or (None if _sensor(asked).endswith(".toml") else otherwise)
+
+
+def _least_bits(path: Path) -> int:
+    """Return the bits per code of a bare array that states none: 1 of truth values, else 3."""
+    return 1 if load_array(path).dtype == np.bool_ else 3
 
 
 def assumed(codes: Codes, method: Restorer) -> str:

@@ -110,14 +110,22 @@ def test_a_sensor_file_clashes_with_its_own_bits_alone(planes, capsys):
 
 
 def test_single_planes_are_calibrated_as_sums(planes, capsys):
-    """`--bits 1 --planes 3` of planes finds the rate of `--planes 3` of their sums; a stream states its bit."""
+    """`--planes 3` of planes finds the rate of `--summed 3` of their sums; both rates are printed."""
     np.save("sums.npy", planes.reshape(20, 3, 5, 13).sum(axis=1).astype(np.uint8))
     found = []
-    for source, bits in (("sums.npy", ""), ("flat.npy", "--bits 1"), ("cap.npy", ""), ("cube.npy --width 13", "")):
+    for source, words in (
+        ("sums.npy", "--summed 3"),
+        ("flat.npy", "--planes 3 --bits 1"),
+        ("cap.npy", "--planes 3"),
+        ("cube.npy --width 13", "--planes 3"),
+    ):
         name, *more = source.split()
-        line = f"calibrate --planes 3 {bits} --dark {name} 1e-4 {' '.join(more)} -o s.toml --json --force"
+        line = f"calibrate {words} --dark {name} 1e-4 {' '.join(more)} -o s.toml --json --force"
         assert main(line.split()) == 0
-        found.append(json.loads(capsys.readouterr().out)["values"]["dark_count_rate"])
+        told = json.loads(capsys.readouterr().out)
+        found.append(told["values"]["dark_count_rate"])
+        rate = "10000 planes/s, 3333.33 codes/s" if name == "cap.npy" else "rate not stated"
+        assert told["rates"] == {name: f"3 planes per code, {rate}"}
     assert all(value == found[0] for value in found)
     assert "bits" not in Path("s.toml").read_text().split("[sources]")[0]
 
@@ -132,3 +140,121 @@ def test_sums_of_a_still_scene_are_scored_against_the_light_behind_their_saturat
     moment, naive = json.loads(capsys.readouterr().out)["scores"]
     assert abs(moment["scale"] - 1) < 0.05  # 11 codes of 10 planes: 2 % in the mean of 480 pixels, at most
     assert naive["scale"] > 1.1
+
+
+@pytest.fixture
+def camera_sums(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Array:
+    """Sums of 200 planes that a camera made, uint8 [12, 5, 13], bare and as raw bytes."""
+    monkeypatch.chdir(tmp_path)
+    drawn = np.random.default_rng(3).binomial(200, 0.4, (12, 5, 13)).astype(np.uint8)
+    np.save("sums.npy", drawn)
+    drawn.tofile("sums.bin")
+    return drawn
+
+
+RAW = "--layout raw --height 5 --width 13 --bits 8 --frame-rate 100"
+OF_200 = "200 planes per code, one code every 400 planes, 20000 planes/s, 50 codes/s"
+
+
+def test_sums_that_a_camera_made_are_told_to_every_command(camera_sums, capsys):
+    """200 planes in bytes are 200, not 255: converted, restored, scored, shown and calibrated alike."""
+    assert main(f"convert sums.bin cap {RAW} --summed 200 --from 2 --every 2".split()) == 0
+    assert OF_200 in capsys.readouterr().out
+    stream = Stream.open("cap.json")
+    np.testing.assert_array_equal(stream.codes(), camera_sums[2::2])
+    assert (stream.sensor.levels, stream.info.planes_per_code, stream.exposure) == (201, 200, 0.01)
+    np.testing.assert_allclose(stream.times, (2.5 + 2 * np.arange(5)) / 100)
+    sensor = BinarySPAD(1.0, 0.0).of_planes(200)
+    expected = quiver.restore(camera_sums[2::2], "moment:3", sensor=sensor, exposure=0.01)
+    spad = "--sensor spad-320x240 --summed 200 --frame-rate 100 --from 2 --every 2"
+    for name, source in (("a", "cap.npy"), ("b", f"sums.npy {spad}")):
+        assert quiver_main(f"restore {source} -o {name}.npy --method moment:3".split()) == 0
+        assert OF_200 in capsys.readouterr().out
+        np.testing.assert_array_equal(np.load(f"{name}.npy"), expected)
+    assert main(["preview", "sums.npy", "-o", "p.png", "--summed", "200"]) == 0
+    assert "0 black, 200 white" in capsys.readouterr().out
+    dark = "calibrate --dark sums.npy 1e-4 -o s.toml --json --summed 200"
+    assert main(dark.split()) == 0
+    rate = json.loads(capsys.readouterr().out)["values"]["dark_count_rate"]["value"]
+    assert rate == pytest.approx(-np.log1p(-camera_sums.mean() / 200) / 1e-4, rel=0.02)
+    found = []
+    for source in ("cap.npy --from 0", "sums.npy --summed 200 --from 2 --every 2"):
+        line = f"evaluate --static {source} --frames 2 --methods moment --json --splits 1"
+        assert quiver_main(line.split()) == 0
+        found.append(json.loads(capsys.readouterr().out)["scores"][0]["psnr"])
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("convert sums.bin cap {RAW} --summed 100", "is no sum of 100 planes; give the right --summed"),
+        (
+            "convert sums.bin cap {RAW} --summed 300",
+            "--summed: raw holds 8-bit codes (binary_sum), no sums of 300",
+        ),
+        ("convert sums.bin cap {RAW} --summed 200 --planes 3", "--planes: sums single planes, and with --summed 200"),
+        ("preview sums.npy -o p.png --summed 100", "is no sum of 100 planes; give the right --summed"),
+        ("preview sums.npy -o p.png --summed 200 --bits 8", "leave out --bits"),
+        ("calibrate --dark sums.npy 1e-4 -o s.toml --summed 100", "is not a sum of 100 planes, 0..100"),
+        (
+            "restore sums.npy -o r.npy --summed 200 --sensor quiver-paper",
+            "--summed: quiver-paper: only a clocked SPAD sums",
+        ),
+        (
+            "restore sums.npy -o r.npy --summed 200 --width 99 --sensor spad-320x240",
+            "--summed: sums.npy: packed planes",
+        ),
+        ("evaluate --static sums.npy --summed 200 --bits 8", "--bits: sums of 200 planes are not clipped"),
+    ],
+)
+def test_what_contradicts_a_camera_s_sums_is_one_line(camera_sums, capsys, line, message):
+    run = quiver_main if line.split()[0] in ("restore", "evaluate") else main
+    before = sorted(Path.cwd().iterdir())
+    assert run(line.replace("{RAW}", RAW).split()) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert sorted(Path.cwd().iterdir()) == before
+
+
+def test_some_codes_of_a_stored_sum_and_truth_values_are_restored(planes, capsys):
+    """`--from` of sums counts codes and names no other option; truth values are planes."""
+    assert main(["convert", "cap.npy", "sums", "--planes", "6", "-q"]) == 0
+    capsys.readouterr()
+    assert (
+        quiver_main(["restore", "sums.npy", "-o", "r.npy", "--method", "moment:1", "--from", "3", "--every", "2"]) == 0
+    )
+    assert "6 planes per code, one code every 12 planes, 10000 planes/s, 833.333 codes/s" in capsys.readouterr().out
+    found = json.loads(Path("r.json").read_text())
+    np.testing.assert_allclose(found["times"]["values"], (18 + 3 + 12 * np.arange(4)) / RATE)
+    np.save("true.npy", planes.astype(bool))
+    videos = []
+    for name, words in (("true.npy", ""), ("flat.npy", "--bits 1")):
+        line = f"restore {name} -o v.npy --method moment:3 --sensor spad-320x240 --force -q {words}"
+        assert quiver_main(line.split()) == 0
+        videos.append(np.load("v.npy"))
+    np.testing.assert_array_equal(*videos)
+    np.save("map.npy", np.eye(5, 13, dtype=bool))
+    assert quiver_main(["restore", "cap.npy", "-o", "n.npy", "--no-scan", "--defects", "map.npy"]) == 2
+    assert "--no-scan: the map of defective pixels is given; leave it out" in capsys.readouterr().err
+
+
+def test_random_choices_keep_the_times_of_their_codes(planes):
+    """The middle of each code after the recording began, in two steps as in one; the rates are those of the codes."""
+    rng = np.random.default_rng(5)
+    for n in range(8):
+        start = int(rng.integers(1, 9))
+        every = int(rng.integers(1, 4))
+        count = int(rng.integers(1, 5))
+        line = f"convert cap.npy a{n} --from {start} --every {every} -q"
+        assert main(line.split()) == 0
+        one = Stream.open(f"a{n}.json")
+        np.testing.assert_allclose(one.times, (start + 0.5 + every * np.arange(len(one))) / RATE)
+        assert main(f"convert a{n}.npy b{n} --planes {count} -q".split()) == 0
+        two = Stream.open(f"b{n}.json")
+        middles = start + 0.5 + every * (count * np.arange(len(two)) + (count - 1) / 2)
+        np.testing.assert_allclose(two.times, middles / RATE)
+        assert two.info.frame_rate == pytest.approx(RATE / every / count)
+        assert ("10000 planes/s" in two.rates) == (every * count > 1)
+        np.testing.assert_array_equal(two.codes(), by_hand(planes[start::every], PlaneSums(planes=count))[: len(two)])

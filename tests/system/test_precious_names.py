@@ -107,7 +107,7 @@ LONGER: dict[str, tuple[Callable[[list[str]], int], str]] = {
     "report": (qsim, "report clip -o r.html"),
     "explore": (qsim, "explore clip -o r.html"),
     "tradeoff": (qsim, "tradeoff wave --ppp 1 --bits 1 --instants 1 -o r"),
-    "calibrate": (qsim, "calibrate --planes 50 --dark dark.npy 1e-5 -o r.toml"),
+    "calibrate": (qsim, "calibrate --summed 50 --dark dark.npy 1e-5 -o r.toml"),
     "train": (quiver, "train set -o r --preset unet --steps 1 --crop 16 --batch 1"),
     "evaluate": (quiver, "evaluate set -o r --methods moment"),
     "bench": (quiver, "bench --methods moment --size 16x16 -o r"),

@@ -64,7 +64,7 @@ def test_one_frame_of_sums_is_enough():
 def test_values_above_the_planes_name_their_place():
     with pytest.raises(ValueError, match=r"5 at \(t, y, x\) = \(1, 0, 0\) is not a sum of 4 planes, 0..4"):
         measure_sums([np.zeros((1, H, W), int), np.full((1, H, W), 5)], planes=4, exposure=1e-5, photons=None)
-    with pytest.raises(ValueError, match="sums of N binary planes are calibrated with planes=N"):
+    with pytest.raises(ValueError, match="sums of N binary planes are calibrated with summed=N"):
         measure([np.full((1, H, W), 19)], bits=1, exposure=1e-5, photons=None)
 
 

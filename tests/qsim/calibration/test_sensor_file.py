@@ -9,6 +9,7 @@ from qsim.calibration.sensor_file import read_counts, read_stack, sensor_of, to_
 from qsim.calibration.spad import calibrate_spad
 from qsim.formats import photon_times
 from qsim.formats.recording import Hints
+from qsim.plane_sums import PlaneSums
 from qsim.sensor import devices
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
@@ -69,7 +70,7 @@ def test_planes_of_a_stream_need_no_width(tmp_path):
         assert np.array_equal(found.total, one.codes().sum(axis=0, dtype=float))
     with pytest.raises(ValueError, match="is a stream of 11 pixels per row, not 12; leave width= out"):
         read_stack(one.path, bits=1, exposure=5e-4, photons=None, hints=Hints(width=12))
-    found = read_stack(sums.path, bits=1, exposure=5e-4, photons=None, planes=3)
+    found = read_stack(sums.path, bits=1, exposure=5e-4, photons=None, sums=PlaneSums(summed=3))
     assert (found.frames, found.mean) == (9, pytest.approx(sums.codes().mean() / 3))
 
 
@@ -84,14 +85,18 @@ def test_photon_times_are_calibrated_as_the_counts_of_their_pixels(tmp_path):
     few = read_stack(path, bits=3, exposure=5e-4, photons=None)
     assert np.array_equal(few.total, np.minimum(stream.codes(), 7).sum(axis=0, dtype=float))
     planes = photon_times.read(path).clocked(50)
-    sums = read_stack(path, bits=1, exposure=1e-5, photons=None, planes=50)
+    sums = read_stack(path, bits=1, exposure=1e-5, photons=None, sums=PlaneSums(summed=50))
     assert (sums.frames, sums.mean) == (200, pytest.approx(planes.mean()))
     fired = read_stack(path, bits=1, exposure=5e-4, photons=None)
     assert np.array_equal(fired.total, photon_times.read(path).clocked(1).sum(axis=0, dtype=float))
     for seconds, more, message in (
         (1e-3, {"bits": 8}, "an exposure of 0.001 s; the photon times state 0.0005 s, give that"),
-        (5e-4, {"bits": 1, "planes": 50}, "an exposure of 0.0005 s; the photon times state 1e-05 s, give that"),
-        (5e-4 / 300, {"bits": 1, "planes": 300}, "of photon times sums of at most 255 are made"),
+        (
+            5e-4,
+            {"bits": 1, "sums": PlaneSums(summed=50)},
+            "an exposure of 0.0005 s; the photon times state 1e-05 s, give that",
+        ),
+        (5e-4 / 300, {"bits": 1, "sums": PlaneSums(summed=300)}, "of photon times sums of at most 255 are made"),
         (5e-4, {"bits": 1, "hints": Hints(width=7)}, "width= changes nothing for photon times; leave it out"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -119,7 +124,7 @@ def test_a_stream_has_the_exposure_that_it_states(tmp_path):
         with pytest.raises(ValueError, match=r"a stream of codes of 0\.0005 s, not of 0\.001 s; give what it states"):
             read_stack(path, bits=1, exposure=1e-3, photons=0.0)
     sums = clip.sense("spad-320x240", ppp=1.0, bits=3, name="sums")
-    found = read_stack(sums.path, bits=3, exposure=5e-4 / 7, photons=0.0, planes=7)
+    found = read_stack(sums.path, bits=3, exposure=5e-4 / 7, photons=0.0, sums=PlaneSums(summed=7))
     assert found.exposure == pytest.approx(5e-4 / 7)
     with pytest.raises(ValueError, match=r"is a stream of codes of 0\.0005 s"):
-        read_stack(sums.path, bits=3, exposure=5e-4, photons=0.0, planes=7)
+        read_stack(sums.path, bits=3, exposure=5e-4, photons=0.0, sums=PlaneSums(summed=7))

@@ -39,12 +39,12 @@ def test_command_reads_sums_of_every_kind_of_file_alike(folder, capsys):
     found = []
     for n, words in enumerate(("dark.npy flat.npy", "dark.mat flat.mat", "dark.mat flat.npy")):
         dark, flat = words.split()
-        found.append(calibrated(capsys, f"--planes 50 --dark {dark} 1e-5 --flat {flat} 1e-5 0.9 -o s{n}.toml"))
+        found.append(calibrated(capsys, f"--summed 50 --dark {dark} 1e-5 --flat {flat} 1e-5 0.9 -o s{n}.toml"))
     assert found[0] == found[1] == found[2]
 
 
 def test_what_is_assumed_is_printed(folder, capsys):
-    assert main(["calibrate", "--planes", "50", "--dark", "dark.npy", "1e-5", "-o", "a.toml"]) == 0
+    assert main(["calibrate", "--summed", "50", "--dark", "dark.npy", "1e-5", "-o", "a.toml"]) == 0
     assert (
         "taken as: sums of 50 binary planes of a SPAD; seconds and photons are those of one plane"
         in capsys.readouterr().out
@@ -56,21 +56,21 @@ def test_what_is_assumed_is_printed(folder, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--model spad --bits 13 --dark dark.npy 1e-5", "may be sums of binary planes; give --planes N"),
-        ("--model spad --bits 1 --dark dark.npy 1e-5", "sums of N binary planes are calibrated with --planes N"),
-        ("--planes 4 --dark dark.npy 1e-5", "is not a sum of 4 planes, 0..4"),
-        ("--planes 50 --bits 6 --dark dark.npy 1e-5", "--bits: --planes 50 are 1-bit planes; leave it out"),
-        ("--planes 0 --dark dark.npy 1e-5", "--planes: expected a whole number from 1 to 16777216, got '0'"),
-        ("--planes 50 --model qis --dark dark.npy 1e-5", "--planes: a QIS is calibrated from its own codes"),
-        ("--planes 50 --static dark.npy 1e-5", "--planes: binary planes have no dead time"),
+        ("--model spad --bits 13 --dark dark.npy 1e-5", "may be sums of binary planes; give --summed N"),
+        ("--model spad --bits 1 --dark dark.npy 1e-5", "sums of N binary planes are calibrated with --summed N"),
+        ("--summed 4 --dark dark.npy 1e-5", "is not a sum of 4 planes, 0..4"),
+        ("--summed 50 --bits 6 --dark dark.npy 1e-5", "--bits: sums of 50 planes have bits of their own; leave it out"),
+        ("--summed 0 --dark dark.npy 1e-5", "--summed: expected a whole number from 1 to 65535, got '0'"),
+        ("--summed 50 --model qis --dark dark.npy 1e-5", "--summed: a QIS is calibrated from its own codes"),
+        ("--summed 50 --static dark.npy 1e-5", "--summed: binary planes have no dead time"),
         ("--bits 8 --width 14 --static dark.npy 1e-5", "--width: it is for packed binary planes"),
         ("--bits 8 --every 2 --static dark.npy 1e-5", "--every: the counts of --static are used as a whole"),
-        ("--planes 50 --to 999 --dark dark.npy 1e-5", "--to: 999: dark.npy has 6 planes; give 6 or less"),
-        ("--planes 50 --paralyzable --dark dark.npy 1e-5", "--paralyzable: binary planes have no dead time"),
-        ("--planes 50 --ignore-dead-time --dark dark.npy 1e-5", "--ignore-dead-time: binary planes have no dead time"),
-        ("--planes 50 --variable x --dark dark.npy 1e-5", "--variable names an array of a .mat file; leave it out"),
-        ("--planes 50 --dark two.mat 1e-5", "holds the arrays ['a', 'b']; choose one with --variable a"),
-        ("--planes 50 --variable c --dark two.mat 1e-5", "has no array c; it holds ['a', 'b']"),
+        ("--summed 50 --to 999 --dark dark.npy 1e-5", "--to: 999: dark.npy has 6 planes; give 6 or less"),
+        ("--summed 50 --paralyzable --dark dark.npy 1e-5", "--paralyzable: binary planes have no dead time"),
+        ("--summed 50 --ignore-dead-time --dark dark.npy 1e-5", "--ignore-dead-time: binary planes have no dead time"),
+        ("--summed 50 --variable x --dark dark.npy 1e-5", "--variable names an array of a .mat file; leave it out"),
+        ("--summed 50 --dark two.mat 1e-5", "holds the arrays ['a', 'b']; choose one with --variable a"),
+        ("--summed 50 --variable c --dark two.mat 1e-5", "has no array c; it holds ['a', 'b']"),
         ("--dark dark.npy 1e-5", "--bits: is needed, as in --bits 8"),
         ("--bits 8 --paralyzable --dark dark.npy 1e-5", "--paralyzable: it is for --model spad and --static; leave"),
         ("--bits 8 --ignore-dead-time --dark dark.npy 1e-5", "--ignore-dead-time: it is for --model spad"),
@@ -102,7 +102,7 @@ def test_options_that_cannot_act_are_refused(folder, capsys, words, message):
         ("--model spad --bits 4 --dark none.npy 1e-5 --flat full.npy 1e-5", "all frames of flat 0 are alike"),
         ("--model spad --bits 4 --dark full.npy 1e-5", "all frames of dark 0 are alike"),
         ("--model spad --bits 1 --dark none.npy 1e-5 --flat ones.npy 1e-5 1", "all frames of flat 0 are alike"),
-        ("--planes 15 --dark full.npy 1e-5", "all frames of dark 0 are alike"),
+        ("--summed 15 --dark full.npy 1e-5", "all frames of dark 0 are alike"),
         ("--model spad --bits 8 --dark noise.npy 1e-5 --flat none.npy 1e-5", "flat 0 holds no count at all"),
         ("--bits 8 --dark noise.npy 1e-5 --flat same.npy 1e-5", "all frames of flat 0 are alike, which determines"),
         ("--bits 8 --dark same.npy 1e-5 --flat same.npy 1e-5", "all frames of dark 0 are alike, which determines"),
@@ -157,15 +157,15 @@ def test_each_option_changes_the_answer(folder, capsys):
     plain = calibrated(capsys, f"--model spad --bits 6 {pair} -o a.toml")
     deeper = calibrated(capsys, f"--model spad --bits 7 {pair} -o c.toml")
     assert deeper["dark_count_rate"]["value"] == pytest.approx(plain["dark_count_rate"]["value"], rel=1e-6)
-    assert calibrated(capsys, f"--model spad --planes 1 --bits 6 {pair} -o d.toml") == plain
-    assert calibrated(capsys, f"--planes 50 {pair} -o e.toml") != plain
-    both = [calibrated(capsys, f"--planes 50 --variable {name} --dark two.mat 1e-5 -o of_{name}.toml") for name in "ab"]
+    assert calibrated(capsys, f"--model spad --summed 1 --bits 6 {pair} -o d.toml") == plain
+    assert calibrated(capsys, f"--summed 50 {pair} -o e.toml") != plain
+    both = [calibrated(capsys, f"--summed 50 --variable {name} --dark two.mat 1e-5 -o of_{name}.toml") for name in "ab"]
     assert both[0] != both[1]
 
 
 def test_an_efficiency_that_cannot_be_is_not_written_without_a_word(folder, capsys):
     """Photons too few by 100 gave a sensor of efficiency 1 without a warning; swapped files gave an error about pde."""
-    line = "--planes 50 --dark {} 1e-5 --flat {} 1e-5 {} -o e.toml --force"
+    line = "--summed 50 --dark {} 1e-5 --flat {} 1e-5 {} -o e.toml --force"
     for photons, odd in ((0.9, False), (0.006, True)):
         assert main(["calibrate", *line.format("dark.npy", "flat.npy", photons).split()]) == 0
         assert ("above 1, and the sensor file holds 1: are photons" in capsys.readouterr().out) == odd

@@ -78,12 +78,13 @@ def test_flow_of_sums_leads_from_code_to_code_and_clips_without_truth_have_none(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("clip p.h5", "no stream in 1 clips; make streams with `qsim sense`"),
-        ("lit p.h5", "no stream of 11 codes in 1 clips"),
+        ("clip p.h5", "no window of 11 codes in 0 streams; make some with `qsim sense`"),
+        ("lit p.h5", "no window of 11 codes in 1 streams"),
         ("lit p.zarr --to pairs --window 2", "p.zarr: pairs are written to one HDF5 file; name it .h5"),
         ("lit foreign.h5 --window 2 --force", "foreign.h5: was not written by `qsim convert`"),
         ("lit foreign.h5 --window 2", "foreign.h5: exists; name another"),
-        ("lit/streams/s.json p.h5", "pairs are made of a data set or a clip"),
+        ("lit p.h5 --window 1 --every 3", "--every: windows of pairs are made of all codes of a stream; leave it out"),
+        ("lit p.h5 --window 1 --planes 3", "--planes: sums planes of one bit, and lit/streams/s.npy holds codes of 3"),
         ("lit p.h5 --window 0", "expected a whole number from 1"),
     ],
 )
@@ -108,7 +109,7 @@ def test_clips_of_unequal_sizes_are_refused(tmp_path: Path):
     for clip in clips:
         clip.sense("quiver-paper", ppp=2.0)
     with pytest.raises(ValueError, match="clips c20 and c22 are 36 x 20 and 36 x 22 px; convert them one by one"):
-        pairs.write({"all": clips}, tmp_path / "p.h5", 3)
+        pairs.write({"all": pairs.streams_of(clips)}, tmp_path / "p.h5", 3)
 
 
 def test_only_our_own_file_is_replaced_and_a_failure_leaves_the_old_one(tmp_path: Path, monkeypatch):
@@ -116,16 +117,35 @@ def test_only_our_own_file_is_replaced_and_a_failure_leaves_the_old_one(tmp_path
 
     clip = write_clip(tmp_path / "c", frames=4)
     clip.sense("quiver-paper", ppp=2.0)
-    pairs.write({"all": [clip]}, tmp_path / "p.h5", 2)
+    pairs.write({"all": pairs.streams_of([clip])}, tmp_path / "p.h5", 2)
     old = (tmp_path / "p.h5").read_bytes()
 
     def stop(done: int, total: int) -> None:
         raise OSError("the disk was taken away")
 
     with pytest.raises(OSError, match="taken away"):
-        pairs.write({"all": [clip]}, tmp_path / "p.h5", 4, force=True, progress=stop)
+        pairs.write({"all": pairs.streams_of([clip])}, tmp_path / "p.h5", 4, force=True, progress=stop)
     assert (tmp_path / "p.h5").read_bytes() == old
     assert len(list(tmp_path.iterdir())) == 2
-    pairs.write({"all": [clip]}, tmp_path / "p.h5", 4, force=True)
+    pairs.write({"all": pairs.streams_of([clip])}, tmp_path / "p.h5", 4, force=True)
     with h5py.File(tmp_path / "p.h5", "r") as file:
         assert file["all/codes"].shape[:2] == (1, 4)
+
+
+def test_pairs_of_stored_planes_are_those_of_their_sums(tmp_path: Path, monkeypatch, capsys):
+    """A clip's planes, or one stream of them, summed now: as the pairs of the sums that were sensed."""
+    monkeypatch.chdir(tmp_path)
+    for name, options in (("c", {"bits": 1, "ppp": 1.0}), ("d", {"planes": 3, "ppp": 3.0})):
+        square_clip(tmp_path / name / "clip", frames=9).sense("spad-320x240", name="s", **options)
+    for n, words in enumerate(
+        ("c/clip --planes 3", "c/clip/streams/s.npy --planes 3", "d/clip", "d/clip/streams/s.json")
+    ):
+        source, *more = words.split()
+        assert main(["convert", source, f"p{n}.h5", "--to", "pairs", "--window", "2", *more, "-q"]) == 0
+    for n in range(3):
+        with h5py.File(f"p{n}.h5") as one, h5py.File("p3.h5") as other:
+            for name in other["all"]:
+                if name not in ("clip", "sensor"):
+                    np.testing.assert_array_equal(one["all"][name][...], other["all"][name][...], err_msg=name)
+    assert main(["convert", "c/clip/streams/s.npy", "x.dat", "--planes", "3"]) == 2
+    assert "c/clip/streams/s.npy: a spike file holds one bit per pixel" in capsys.readouterr().err

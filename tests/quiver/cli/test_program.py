@@ -188,9 +188,9 @@ def test_impossible_values_are_named(capsys, clip, tmp_path, words, message):
 @pytest.mark.parametrize(
     ("array", "message"),
     [
-        (np.zeros((0, 4, 4), np.uint8), "expected integer codes [T, H, W] without an empty axis"),
-        (np.zeros((3, 0, 4), np.uint8), "expected integer codes [T, H, W] without an empty axis"),
-        (np.full((3, 4, 4), np.nan), "expected integer codes"),
+        (np.zeros((0, 4, 4), np.uint8), "expected whole codes [T, H, W] without an empty axis"),
+        (np.zeros((3, 0, 4), np.uint8), "expected whole codes [T, H, W] without an empty axis"),
+        (np.full((3, 4, 4), np.nan), "expected whole codes"),
         (np.full((3, 4, 4), 9, np.uint8), "code 9 at (t, y, x) = (0, 0, 0); a 3-bit sensor has 0..7"),
     ],
 )

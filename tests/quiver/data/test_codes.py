@@ -61,7 +61,7 @@ def test_codes_in_memory_are_checked():
     codes[2, 1, 3] = 8
     with pytest.raises(ValueError, match=r"code 8 at \(t, y, x\) = \(2, 1, 3\); a 3-bit sensor has 0\.\.7"):
         array_codes(codes, sensor, EXPOSURE).read(1, 3)
-    with pytest.raises(ValueError, match=r"expected integer codes \[T, H, W\]"):
+    with pytest.raises(ValueError, match=r"expected whole codes \[T, H, W\]"):
         array_codes(np.zeros((0, 4, 5), np.uint8), sensor, EXPOSURE)
     assert as_input(np.full((1, 2, 2), 7, np.uint8), sensor).max() == 1.0
 

@@ -28,18 +28,19 @@ VALUES = {
     "seed": 5,
     "width": 7,
     "planes": 7,
+    "summed": 7,
     "frame-rate": 500,
     "mode": "exact",
     "device": "cpu",
     "precision": "float32",
 }
 REFUSED = {  # by kind of input, with a classical method
-    "stream": ["stream", "sensor", "ppp", "bits", "seed", "width", "planes", "frame-rate"],
+    "stream": ["stream", "sensor", "ppp", "bits", "seed", "width", "planes", "summed", "frame-rate"],
     "clip": ["sensor", "bits", "seed", "width", "planes", "frame-rate"],
     "clip --stream mine": ["sensor", "ppp", "bits", "seed", "width", "planes", "frame-rate"],
-    "clip --ppp 3": ["stream", "width", "planes", "frame-rate"],
+    "clip --ppp 3": ["stream", "width", "summed", "frame-rate"],
     "array --sensor quiver-paper": ["stream", "ppp", "seed", "planes"],
-    "planes --sensor spad-320x240 --width 7": ["stream", "ppp", "seed", "bits"],
+    "planes --sensor spad-320x240 --width 7": ["stream", "ppp", "seed", "bits", "summed"],
     "planes --sensor spad-320x240 --width 7 --planes 7": ["stream", "ppp", "seed", "bits"],
 }
 
