@@ -28,6 +28,7 @@ import numpy as np
 from numpy import ndarray as Array
 from scipy.fft import dct
 from scipy.ndimage import correlate1d, uniform_filter, uniform_filter1d
+from scipy.special import expit, logit
 from scipy.stats import chi2
 
 from qsim.checks import ArgumentError
@@ -54,6 +55,10 @@ LEAST = 1e-3  # variance of a code [codes^2], at least
 SLACK = 1.25  # on the part of a change that light in common explains
 FEW_PIXELS = 28  # of such a side; with FEW_COUNTS in them at a time, or less, light is little
 FEW_COUNTS = 300
+PREDICTED = 31  # px, side of the square in which pixels tell how well neighbours predict a pixel
+LIKELY = 0.9  # that a pixel like a hot one is hot, before its own changes are seen
+SEEN_BEFORE = 20  # pixels that this belief counts
+ROUNDS = 50
 NEAR = 5  # px, side of the square of neighbours in little light
 WIDE_SIDE = (7, 6)  # px, width and depth of what is compared there
 WIDE = 15  # px, side of the square over which motion is averaged
@@ -140,7 +145,9 @@ class _Seen:
     bright: Array  # bool [H, W]: so at every time
     moving: Array  # bool [H, W]: the light around it moves
     apart: Array  # bool [H, W]: does not follow its neighbours
-    followed: Array  # [3, H, W]: changes that it shares with its neighbours; those of its neighbours; noise in them
+    # [2, 3, H, W], of all changes and of slow ones: what it shares with its neighbours; their changes; noise in these
+    followed: Array
+    added: Array  # [H, W]: log of the odds that it adds to what passes by, against light that hides it
 
     @classmethod
     def of(cls, means: Array, response: Response, frames: int) -> _Seen:
@@ -171,6 +178,7 @@ class _Seen:
             _moving(means, ring, own) | (little & _moving_in_little_light(clean, clean_noise)),
             ~_follows(means, ring, own, beside),
             _shared(means, around, own, np.where(little, clean_noise / pixels, beside), response),
+            _adding(means, stands_out, own.mean(axis=0) if own.ndim == 3 else own, response, frames),
         )
 
     @property
@@ -180,7 +188,23 @@ class _Seen:
 
     @property
     def hot(self) -> Array:
-        """Pixels that are hot, bool [H, W]: the proven ones, and others if their share explains these."""
+        """Pixels that are hot, bool [H, W]: those of `alike` that are more likely so than lamps, given all of them.
+
+        The share of hot pixels among them follows from their own odds, with LIKELY before anything is seen.
+        """
+        alike = self.alike
+        odds = self.added[alike]
+        share = LIKELY
+        for _ in range(ROUNDS):
+            chance = expit(odds + logit(share))
+            share = float((chance.sum() + LIKELY * SEEN_BEFORE) / (len(odds) + SEEN_BEFORE))
+        hot = np.zeros_like(alike)
+        hot[alike] = odds + logit(share) > 0
+        return hot
+
+    @property
+    def alike(self) -> Array:
+        """Pixels that stay as bright as hot ones, bool [H, W]: the proven, and others if their share explains these."""
         proven = self.proven
         candidates = self.bright & self.moving
         count = int(candidates.sum())
@@ -195,14 +219,13 @@ class _Seen:
 
     def _apart_together(self, candidates: Array) -> bool:
         """Return whether some pixels, taken together, surely follow less than TOGETHER of what changes around them."""
-        sums = self.followed[:, candidates].sum(axis=1)
-        shared = sums[0]
-        around = sums[1]
-        noise = sums[2]
-        changes = around - noise
-        if changes < SURE * noise * np.sqrt(2 / (int(candidates.sum()) * (TIMES - 1))):
-            return False
-        return bool(shared + SURE * np.sqrt(around) < TOGETHER * changes)
+        sums = self.followed[:, :, candidates].sum(axis=2)
+        for (shared, around, noise), terms in zip(sums, (TIMES - 1, SLOW), strict=True):
+            changes = around - noise
+            measured = changes >= SURE * noise * np.sqrt(2 / (int(candidates.sum()) * terms))
+            if measured and shared + SURE * np.sqrt(around) < TOGETHER * changes:
+                return True
+        return False
 
 
 def _ring(means: Array) -> Array:
@@ -263,6 +286,35 @@ def _moving_in_little_light(means: Array, noise: Array) -> Array:
         for dy, dx in ((-AWAY, 0), (AWAY, 0), (0, -AWAY), (0, AWAY))
     ]
     return np.asarray(np.minimum.reduce(sides_of) > MOVED)
+
+
+def _adding(means: Array, out: Array, own: Array, response: Response, frames: int) -> Array:
+    """Return the log of the odds [H, W] that a pixel is hot, not a lamp of one pixel before what moves.
+
+    A hot pixel sees the scene and adds to it: its light changes as that of its neighbours does, as far as one predicts
+    the other in the pixels around. A lamp hides what is behind it: its light does not change with theirs.
+    """
+    good = (~out).astype(float)
+    near = (_box(means * good, 3) - means * good) / np.maximum(_box(good, 3) - good, 1.0)
+    level = near.mean(axis=0)
+    around = near - level
+    change = means - means.mean(axis=0)
+    squares = (around**2).sum(axis=0)
+    products = (around * change).sum(axis=0)
+    pixels = np.maximum(_box(good, PREDICTED), 1.0)
+
+    def ordinary(values: Array) -> Array:
+        return np.asarray(_box(values * good, PREDICTED) / pixels)
+
+    predicted = np.clip(ordinary(products) / np.maximum(ordinary(squares), 1e-12), 0.0, 1.0)
+    left = (change**2).sum(axis=0) - 2 * predicted * products + predicted**2 * squares
+    shot = np.interp(level, response.mean, response.variance) / frames
+    structure = np.maximum(ordinary(left) / (len(means) - 1) - ordinary(shot), 0.0)
+    rise = np.gradient(response.mean, response.photons)
+    slopes = [np.interp(codes, response.mean, rise) for codes in (means.mean(axis=0), level)]
+    factor = slopes[0] / np.maximum(slopes[1], 1e-12)  # codes near the top change less
+    slope = predicted * factor
+    return np.asarray((slope * products - slope**2 * squares / 2) / (own + structure * factor**2))
 
 
 def _robust_square(values: Array) -> Array:
@@ -333,18 +385,19 @@ def _follows(means: Array, ring: Array, own: Array, beside: Array) -> Array:
 
 
 def _shared(means: Array, ring: Array, own: Array, beside: Array, response: Response) -> Array:
-    """Return what each pixel has of the changes of its neighbours' light, in units of its noise, [3, H, W].
+    """Return what each pixel has of the changes of its neighbours' light, in units of its noise, [2, 3, H, W].
 
-    They are the sums over time of change times change, of the neighbours' change squared, and of the noise in that.
-    Neighbours are scaled to the light of the pixel, whose codes change less the nearer they are to the top.
+    They are the sums of change times change, of the neighbours' change squared, and of the noise in that: over all
+    frequencies, and over slow ones. Neighbours are scaled to the light of the pixel, whose codes change less the nearer
+    they are to the top.
     """
     rise = np.gradient(response.mean, response.photons)
     levels = means.mean(axis=0), ring.mean(axis=0)
     light, around = (np.interp(level, response.mean, response.photons) for level in levels)
     slope, slope_around = (np.interp(level, response.mean, rise) for level in levels)
     ratio = light / np.maximum(around, 1e-6) * slope / np.maximum(slope_around, 1e-12)
-    expected = ratio * (ring - levels[1])
-    change = means - levels[0]
-    shared = (change * expected).sum(axis=0)
-    noise = (1 - 1 / len(means)) * (ratio**2 * beside).sum(axis=0)
-    return np.stack([shared, (expected**2).sum(axis=0), noise]) / own
+    expected = dct(ratio * (ring - levels[1]), axis=0, norm="ortho")[1:]
+    change = dct(means - levels[0], axis=0, norm="ortho")[1:]
+    noise = np.broadcast_to((ratio**2 * beside).mean(axis=0), change.shape)
+    terms = np.stack([change * expected, expected**2, noise])
+    return np.stack([terms.sum(axis=1), terms[:, :SLOW].sum(axis=1)]) / own

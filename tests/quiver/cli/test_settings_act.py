@@ -189,6 +189,9 @@ SITUATIONS = (
     Situation(SCORE, scores, only=("methods",)),
     Situation(COUNTS, static_scores, only=("methods",)),
     Situation(PLANES, static_scores, {"start": "2", "stop": "18", "every": "2"}),
+    Situation(
+        PLANES.replace("planes.npy --width 24", "codes.npy"), static_scores, {"summed": "7"}, only=("summed", "planes")
+    ),
     Situation(PLANES.replace(" --width 24", ""), static_scores, {"width": "24"}, only=("width",)),
     Situation(SCORE_NET, scores),
     Situation(SCORE_NET.replace(" --mode streaming", ""), scores, {"mode": "streaming"}, only=("mode",)),

@@ -17,7 +17,9 @@ from clips import ClipMaker
 from numpy import ndarray as Array
 
 from qsim.formats import pairs
+from qsim.formats.summing import summed
 from qsim.keys import Key
+from qsim.plane_sums import PlaneSums
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
@@ -50,7 +52,7 @@ class Case:
         planes = rng.choice([1, 2, 3, 7])
         model = rng.choice(["sum", "sum", "qis", "counter"])
         if model == "sum":
-            planes = rng.choice([1, 2, 3, 5, 7])
+            planes = rng.choice([1, 2, 3, 4, 5, 6, 7, 10])
             sensor: Sensor = BinarySPAD(0.6, 300.0, planes.bit_length(), planes)
         elif model == "qis":
             sensor = QIS(0.8, 40.0, 0.3, rng.choice([1, 3, 10]))
@@ -146,11 +148,27 @@ def check(case: Case, clip: Clip, rng: random.Random) -> None:
         np.testing.assert_allclose(its.video(), truth, rtol=1e-12)
         assert (own.exposure, own.frame_rate) == pytest.approx((stream.exposure, stream.info.frame_rate))
     check_windows(case, clip, rng, codes, photons, truth, Key(case.sensing.seed, stream.info.clip_key))
+    if case.summed and case.shares == (1.0,) and not (case.drift or case.shift):
+        check_stored_planes(case, clip, codes, truth)
     if case.shares == (1.0,):
         window = pairs.Window(clip, stream, 1, case.codes - 1)
         np.testing.assert_array_equal(window.codes(), codes[1:])
         np.testing.assert_allclose(window.truth(), truth[1:], rtol=1e-6)
         np.testing.assert_array_equal(window.flow()[:-1], expected_flow(case)[1:])
+
+
+def check_stored_planes(case: Case, clip: Clip, codes: Array, truth: Array) -> None:
+    """Stored planes of the same light, summed when they are read: by evaluation, and for pairs and other programs."""
+    sensor = case.sensing.sensor
+    assert isinstance(sensor, BinarySPAD)
+    assert case.sensing.ppp is not None
+    single = replace(case.sensing, sensor=sensor.plane, ppp=case.sensing.ppp / case.planes, group=False, name="planes")
+    stream, _ = sense(clip, single, force=True)
+    own, its = stored(clip, "planes", case.planes)
+    for found in (own.read(0, case.codes), summed(stream, PlaneSums(planes=case.planes)).codes()):
+        np.testing.assert_array_equal(found, codes)
+    np.testing.assert_allclose(its.video(), truth, rtol=1e-12)
+    assert (own.ppp, own.sensor) == (pytest.approx(case.sensing.ppp), sensor)
 
 
 def expected_flow(case: Case) -> Array:

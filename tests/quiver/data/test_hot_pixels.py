@@ -76,6 +76,31 @@ def test_a_still_star_field_loses_none_of_its_stars(changed, light):
     assert not scan(codes).hot.any()
 
 
+@pytest.mark.parametrize(("light", "speed"), [(0.1, 0.5), (0.3, 0.1), (0.3, 0.5), (1.0, 0.1)])
+def test_hot_pixels_are_found_in_little_light(light, speed):
+    """Sums of 7 planes of a pan: most of what is brighter than the mean light, and nothing else."""
+    hot, dark = spad_camera.hot_map(SHAPE, 0.01, 4)
+    scene = spad_camera.panned(PICTURE, SHAPE, speed)
+    found = scan(codes_of(scene, light, dark)).hot
+    bright = PLANES * dark > 2 * light
+    assert not (found & ~hot).any()
+    assert found[bright].mean() >= 0.9
+    assert not scan(codes_of(scene, light, 0 * dark)).hot.any()
+
+
+def test_lamps_of_one_pixel_before_a_pan_are_no_hot_pixels():
+    """Each hides what passes behind it, and its light does not change; hot pixels add to what passes, and are found."""
+    hot, dark = spad_camera.hot_map(SHAPE, 0.01, 1)
+    rng = np.random.default_rng(6)
+    lamps = (rng.random(SHAPE) < 0.01) & ~hot
+    light = np.exp(rng.uniform(0, np.log(8.0), SHAPE))
+    moved = spad_camera.panned(PICTURE, SHAPE, 0.5)
+    found = scan(codes_of(lambda time: np.where(lamps, light, moved(time)), 3.0, 0 * dark)).hot
+    assert found[lamps].mean() <= 0.25
+    found = scan(codes_of(lambda time: np.where(lamps, light, moved(time)), 3.0, dark)).hot
+    assert found[dark > 0.6].mean() >= 0.8
+
+
 def test_a_mosaic_is_compared_colour_by_colour():
     """Filters that pass half the light to every second pixel are no hot pixels, and hide none."""
     from dataclasses import replace
