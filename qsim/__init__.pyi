@@ -16,6 +16,7 @@ from .rendering.renderer import Renderer as Renderer
 from .scene.scene import Scene as Scene
 from .sensor.counting import CountingSPAD as CountingSPAD
 from .sensor.devices import load as load_sensor  # noqa: F401  (public name)
+from .sensor.drawn import DrawnSensor as DrawnSensor
 from .sensor.packing import pack as pack
 from .sensor.packing import unpack as unpack
 from .sensor.qis import QIS as QIS

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
+from qsim import plugins
 from qsim.cli import documented_keys
 from qsim.cli.command import Idle, command
 from qsim.cli.completion import recipes as recipe_names
@@ -238,10 +239,12 @@ def sensors(asked: Sensors) -> int:
     if asked.keys:
         print_keys(documented_keys.of_sensor_files())
         return 0
-    width = max(map(len, DEVICES))
-    lines = [f"{name:{width}}  {device.what}" for name, device in DEVICES.items()]
+    known = {name: device.what for name, device in DEVICES.items()}
+    known |= dict.fromkeys(plugins.installed(plugins.SENSORS), "of an installed package")
+    width = max(map(len, known))
+    lines = [f"{name:{width}}  {what}" for name, what in known.items()]
     more = "qsim sense CLIP --sensor NAME draws with one; qsim doctor --devices prints every number with its source"
-    output({"sensors": {name: device.what for name, device in DEVICES.items()}}, [*lines, more])
+    output({"sensors": known}, [*lines, more])
     return 0
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qsim import files
+from qsim import files, plugins
 from qsim.files import to_json
 from qsim.kinds import Split
 from qsim.rendering.render_settings import RenderSettings
@@ -73,7 +73,7 @@ class Job:
                 if isinstance(stream.get(key), str):
                     stream[key] = Path(stream[key]).name
         named = (self.family, self.settings.camera_path or "", *(stream.sensor_name for stream in self.streams))
-        own = [path for path in named if Path(path).is_absolute()]
+        own = [plugins.file_of(path) or path for path in named if Path(path).is_absolute()]
         own += [path for stream in self.streams for path in _read_by(stream)]
         if own:  # the content of a file decides, not its name
             described["own"] = [_contents(path) for path in own]
@@ -103,7 +103,10 @@ def _read_by(stream: Sensing) -> list[str]:
     """Return the files that a stream reads beside its sensor's: colour filters, and maps that the sensor's names."""
     filters = [stream.colour] if isinstance(stream.colour, str) and Path(stream.colour).is_absolute() else []
     sensor = stream.sensor_name
-    return [*filters, *(_maps(sensor, _state(sensor)) if Path(sensor).is_absolute() else ())]
+    return [
+        *filters,
+        *(_maps(sensor, _state(sensor)) if sensor.endswith(".toml") and Path(sensor).is_absolute() else ()),
+    ]
 
 
 @functools.lru_cache(maxsize=64)

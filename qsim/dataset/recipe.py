@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from qsim import checks, files, records
+from qsim import checks, files, plugins, records
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.clip_info import ClipInfo
 from qsim.dataset.job import Job
@@ -261,6 +261,8 @@ def _sensings_of(section: StreamsSection, seed: int, beside: Path) -> list[Sensi
     for name in ("sensor", "colour"):
         if str(given.get(name)).endswith(".toml"):
             given[name] = str((beside / given[name]).resolve())
+    if plugins.file_of(str(given.get("sensor"))):
+        given["sensor"] = plugins.beside(str(given["sensor"]), beside)
     return [Sensing(**{"seed": seed} | given, bits=depth, **light) for depth in bits for light in levels]
 
 

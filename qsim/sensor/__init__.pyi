@@ -1,6 +1,7 @@
 from .counting import CountingSPAD as CountingSPAD
 from .defects.pixel_array import PixelArray as PixelArray
 from .devices import load as load
+from .drawn import DrawnSensor as DrawnSensor
 from .estimation import Response as Response
 from .packing import pack as pack
 from .packing import unpack as unpack

@@ -23,12 +23,14 @@ photons" means that light is to be given as photons that this sensor detects. A 
 
 from __future__ import annotations
 
+import inspect
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 
-from qsim import files
+from qsim import files, plugins
 from qsim.checks import ArgumentError, file_path, suggest
 from qsim.host import own_numbers
 from qsim.records import convert
@@ -267,9 +269,11 @@ def load(
         device = DEVICES[str(name)]
         made = device.make(ppp, device.bits if bits is None else bits, exposure)
         return made.with_dark_rate(made.dark_rate * conditions.dark.mean) if device.median and conditions.dark else made
+    if (plugin := plugins.load(str(name), plugins.SENSORS)) is not None:
+        return _of_plugin(plugin, {"ppp": ppp, "bits": bits, "exposure": exposure})
     path = file_path(name)
     if path.suffix != ".toml":
-        raise ValueError(f"unknown sensor {str(name)!r}{suggest(str(name), DEVICES)}; `qsim sensors` lists all")
+        raise ValueError(f"unknown sensor {str(name)!r}{suggest(str(name), names())}; `qsim sensors` lists all")
     sensor = from_toml(path, bits, conditions)
     if bits is not None and bits != sensor.bits:
         cure = "change one of them"
@@ -277,6 +281,36 @@ def load(
             cure = f"{cure}, or delete the line of bits: such a file serves every depth"
         raise ValueError(f"{path}: the file has bits = {sensor.bits}, the request {bits}; {cure}")
     return sensor
+
+
+def names() -> list[str]:
+    """Return the names of all sensors: those of this package, and of installed ones."""
+    return [*DEVICES, *plugins.installed(plugins.SENSORS)]
+
+
+def _of_plugin(plugin: plugins.Plugin, given: Mapping[str, float | None]) -> Sensor:
+    """Return the sensor of others: a class, a function that makes one, or a sensor.
+
+    A class or function gets those of ppp, bits and exposure [s] that it takes. `ValueError` where it needs others, or
+    makes something else, or other bits.
+    """
+    made = plugin.made
+    if callable(made) and not isinstance(made, Sensor):
+        taken = inspect.signature(made).parameters
+        named = {name: one for name, one in taken.items() if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)}
+        needed = [name for name, one in named.items() if one.default is one.empty and given.get(name) is None]
+        if needed:
+            raise ValueError(
+                f"{plugin.name}: needs {', '.join(needed)}; give defaults, or name a function that makes the sensor"
+            )
+        made = made(**{name: value for name, value in given.items() if name in taken and value is not None})
+    if not isinstance(made, Sensor):
+        raise ValueError(f"{plugin.name}: is no sensor; name a class below qsim.Sensor, or a function that makes one")
+    check_known(made)
+    bits = given["bits"]
+    if bits is not None and bits != made.bits:
+        raise ValueError(f"{plugin.name}: has bits = {made.bits}, the request {bits}; change one of them")
+    return made
 
 
 def load_sum(
@@ -398,10 +432,26 @@ def table_of(name: str | Path | Sensor) -> Mapping[str, object]:
 def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:
     """Return the sensor that `Sensor.to_dict` described: {"model": "QIS", field: value, ...}; strict, `ValueError`."""
     name = settings.get("model")
+    if isinstance(name, str) and isinstance(settings.get("plugin"), Mapping):
+        return _of_others(name, settings, where)
     if not isinstance(name, str) or name not in MODELS:
         raise ValueError(f"{where}: model is one of {', '.join(MODELS)}, got {name!r}{suggest(str(name), MODELS)}")
     values = {key: value for key, value in settings.items() if key != "model"}
     return convert(values, MODELS[name], where)
+
+
+def _of_others(name: str, settings: Mapping[str, object], where: str) -> Sensor:
+    """Return a stored sensor of others; a warning says where its module is another one than it was."""
+    stored = settings["plugin"]
+    assert isinstance(stored, Mapping)
+    kind, source = plugins.stored_class(name, stored, where)
+    if not issubclass(kind, Sensor):
+        raise ValueError(f"{where}: {name} of {source.module} is no sensor any more; restore its earlier version")
+    if source.sha256 != stored.get("sha256"):
+        warnings.warn(
+            f"{where}: was written with another {source.words()}; codes that are drawn again may differ", stacklevel=2
+        )
+    return convert({key: value for key, value in settings.items() if key not in ("model", "plugin")}, kind, where)
 
 
 def _has_one_depth(model: object) -> bool:
@@ -410,8 +460,8 @@ def _has_one_depth(model: object) -> bool:
 
 
 def is_known(sensor: Sensor) -> bool:
-    """Return whether a sensor is of a model of this package, which a file can name."""
-    return MODELS.get(type(sensor).__name__) is type(sensor)
+    """Return whether a file can name the model of a sensor: one of this package, of a named file, or of a package."""
+    return MODELS.get(type(sensor).__name__) is type(sensor) or plugins.source_of(type(sensor)) is not None
 
 
 def check_known(sensor: Sensor) -> None:
@@ -419,7 +469,8 @@ def check_known(sensor: Sensor) -> None:
     if not is_known(sensor):
         raise ValueError(
             f"{type(sensor).__name__}: is none of the models that a file can name ({', '.join(MODELS)}), so a stored "
-            "stream of it could not be opened; draw its codes by its method `sample` and keep the array"
+            "stream of it could not be opened; name it by its file, as in mine.py:Sensor, or install it as an entry "
+            "point of qsim.sensors"
         )
 
 

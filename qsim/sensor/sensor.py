@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import plugins
 from qsim.arrays import plain
 from qsim.keys import Key, require_counters, words, words_at
 from qsim.sensor import estimation
@@ -283,8 +284,22 @@ class Sensor(Distribution):
         return self.draw(photons, exposure, words(key, shape, origin), second)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the record as files store it: {"model": name of the class, field: value, ...}."""
-        return {"model": type(self).__name__, **asdict(self)}  # type: ignore[call-overload]
+        """Return the record as files store it: {"model": name of the class, field: value, ...}.
+
+        Of a class of others, `plugin` states module, version and digest.
+        """
+        return {"model": type(self).__name__, **asdict(self), **plugins.stated(type(self))}  # type: ignore[call-overload]
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Pickle a class of a named file by its description: another process has the module under no name."""
+        described = self.to_dict() if plugins.is_of_file(type(self)) else {}
+        return (_of_description, (described,)) if described else super().__reduce_ex__(protocol)
+
+
+def _of_description(described: dict[str, Any]) -> Sensor:
+    from qsim.sensor import devices
+
+    return devices.from_dict(described)
 
 
 def _checked(photons: Array, engine: str) -> Array:

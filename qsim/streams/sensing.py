@@ -31,7 +31,9 @@ class Sensing:
 
     sensor: Annotated[
         Text | Sensor,
-        setting("a name of `qsim sensors`, or a .toml file", known=devices.DEVICES.keys, example="quiver-physical"),
+        setting(
+            "a name of `qsim sensors`, a .toml file, or mine.py:Sensor", known=devices.names, example="quiver-physical"
+        ),
     ]
     bits: Annotated[Bits | None, setting("bits per code", unset="the sensor's own", varied=True, example=[1, 3])] = None
     ppp: Annotated[
@@ -165,7 +167,7 @@ class Sensing:
         if self.planes is not None and self.planes != 2 ** self.planes.bit_length() - 1:
             bits += f"_{self.planes}planes"
         seed = f"_seed{self.seed}" if self.seed else ""
-        sensor = Path(self.sensor_name).name.removesuffix(".toml")
+        sensor = Path(self.sensor_name).name.removesuffix(".toml").replace(".py:", "-")
         if isinstance(self.colour, str):
             sensor += f"-{Path(self.colour).name.removesuffix('.toml')}"
         elif self.colour is not None:

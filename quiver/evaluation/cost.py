@@ -26,7 +26,6 @@ from qsim.figures import new_figure, write_figure
 from qsim.files import Progress
 from qsim.keys import Key
 from qsim.tables import markdown_table
-from quiver.baselines import METHODS
 from quiver.data.clips import peak_of
 from quiver.data.code_table import draw_codes
 from quiver.data.codes import Codes, array_codes
@@ -36,7 +35,7 @@ from quiver.evaluation import metrics
 from quiver.model.names import NETWORKS, QUIVERS
 from quiver.restoration.interface import MODES, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, wrap_network
-from quiver.restoration.restorers import restorer, weights_path
+from quiver.restoration.restorers import is_classical, restorer, weights_path
 
 EXPOSURE = 5e-4  # s
 LONG = 10.0  # s; the first run of a process took 7 % longer than the second at 2.5 s, and no longer at 17 s
@@ -104,7 +103,7 @@ def method_of(case: CostCase, device: str) -> tuple[Restorer, bool]:
     from quiver.model.presets import build
 
     options = RestoreOptions(mode=case.mode, precision=case.precision, device=device)
-    if case.method.partition(":")[0] in METHODS:
+    if is_classical(case.method):
         return restorer(case.method, options), True
     try:
         path = weights_path(case.method)
@@ -233,7 +232,7 @@ def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[
     """
     cases = []
     for method in methods:
-        classical = method.partition(":")[0] in METHODS
+        classical = is_classical(method)
         for mode in (CostCase.mode,) if classical or _has_one_mode(method) else modes:
             chosen = (CostCase.precision,) if classical else precisions
             cases += [CostCase(method, mode, precision) for precision in chosen]
@@ -257,7 +256,7 @@ def checked_cases(
     """Return `cases_of` with the defaults for None. `ValueError` for unknown names and options without effect."""
     from quiver.model.weights import load
 
-    networks = [method for method in methods if method.partition(":")[0] not in METHODS]
+    networks = [method for method in methods if not is_classical(method)]
     for method in methods:
         if method not in networks:
             restorer(method)
@@ -284,7 +283,7 @@ def _check_known(option: str, given: Sequence[str] | None, known: Sequence[str])
 
 def device_of(cases: Sequence[CostCase], wanted: str | None) -> str:
     """Return the device of the networks among the cases; without any that of classical methods."""
-    learned = any(case.method.partition(":")[0] not in METHODS for case in cases)
+    learned = any(not is_classical(case.method) for case in cases)
     return pick_device(wanted or "auto") if learned else "cpu"
 
 

@@ -10,18 +10,22 @@ folder.
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import plugins
 from qsim.checks import suggest
 from qsim.files import Progress
 from quiver.baselines import METHODS, exposures
+from quiver.baselines.methods import Method
 from quiver.baselines.sliding_window import look_ahead
 from quiver.data.codes import Codes
 from quiver.model.names import NETWORKS
@@ -30,21 +34,88 @@ from quiver.restoration.networks import network_restorer
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"  # weights that ship with the package
 FRAME_BYTES = 16  # per pixel and frame that a classical method holds: codes and video
+OWN_BYTES = 600  # per pixel that a method of others is taken to hold beside codes and video
 BLOCK_FRAMES = 32  # at most, of a classical method between two reports of progress
 
 
 def restorer(name: str, options: RestoreOptions | None = None) -> Restorer:
     """Return a method by name: classical, shipped weights, weights file or training folder.
 
-    A classical method may be followed by its window in frames, as in `moment:5`. `ValueError` or `FileNotFoundError`
-    for another name.
+    A method of others is named by its file, as in `mine.py:restore`, or by an entry point of `quiver.methods`. A
+    classical method may be followed by its window in frames, as in `moment:5`. `ValueError` or `FileNotFoundError` for
+    another name.
     """
     options = options or RestoreOptions()
+    if _is_of_others(name):
+        base = _plugin_name(name)
+        return _of_others(base, name.removeprefix(base).removeprefix(":"), options)
     base, _, window = name.partition(":")
     if base not in METHODS:
         network = network_restorer(weights_path(name), options)
         return replace(network, fill=partial(_fill_equal_exposures, network.fill, name))
-    method = METHODS[base]
+    return _classical(name, METHODS[base], window, options)
+
+
+def is_classical(name: str) -> bool:
+    """Return whether a name is that of a classical method, or of a method of others, and not of a network."""
+    return name.partition(":")[0] in METHODS or _is_of_others(name)
+
+
+def _is_of_others(name: str) -> bool:
+    base = _plugin_name(name)
+    return plugins.file_of(base) is not None or base in plugins.installed(plugins.METHODS)
+
+
+def _plugin_name(name: str) -> str:
+    """Return a name like `mine.py:restore:5`, or one of an entry point, without its window."""
+    base, _, window = name.rpartition(":")
+    return base if window.isdecimal() else name
+
+
+def _of_others(base: str, window: str, options: RestoreOptions) -> Restorer:
+    """Return a method of others: a function with the signature of the classical ones (baselines/methods.py)."""
+    plugin = plugins.load(base, plugins.METHODS)
+    assert plugin is not None
+    if not callable(plugin.made):
+        raise ValueError(f"{base}: is no function; name one that takes codes, sensor and exposure")
+    parameters = inspect.signature(plugin.made).parameters
+    if lacking := [key for key in ("window", "frames") if key not in parameters]:
+        raise ValueError(
+            f"{base}: its arguments are (codes, sensor, exposure, *, window=11, photons_per_unit=1.0, frames=None); "
+            f"{' and '.join(lacking)} is missing"
+        )
+    default = parameters["window"].default
+    about = next(iter((plugin.made.__doc__ or "").strip().splitlines()), "a method of others")
+    method = OwnMethod(base, "", default if isinstance(default, int) else 11, OWN_BYTES, about, plugin.made)
+    made = _classical(f"{base}:{window}" if window else base, method, window, options)
+    short = f"{Path(base).stem}-{base.rpartition(':')[2]}" if plugins.file_of(base) else base
+    return replace(
+        made,
+        name=f"{short}:{window}" if window else short,
+        identity={**made.identity, "method": short, **asdict(plugin.source)},
+    )
+
+
+@dataclass(frozen=True)
+class OwnMethod(Method):
+    """A method of others: a function in place of the name of one."""
+
+    function: Callable[..., Array] | None = None
+
+    def restore(self, *given: Any, **settings: Any) -> Array:
+        """Restore codes; `ValueError` for an answer of another shape or type."""
+        assert self.function is not None
+        restored = np.asarray(self.function(*given, **settings), np.float32)
+        codes = given[0]
+        expected = (len(settings["frames"]) if settings.get("frames") is not None else len(codes), *codes.shape[1:])
+        if restored.shape != expected:
+            raise ValueError(f"{self.name}: returned {list(restored.shape)}, expected {list(expected)}")
+        return restored
+
+
+def _classical(name: str, method: Method, window: str, options: RestoreOptions) -> Restorer:
+    """Return a classical method with its own window or another one."""
+    base = method.name
     if window and not (window.isdecimal() and int(window) > 0):
         raise ValueError(f"method {name!r}: the window after the colon is a number of frames, as in {base}:5")
     frames = int(window) if window else method.window
@@ -87,7 +158,7 @@ def shipped_names() -> list[str]:
 
 def method_names() -> list[str]:
     """Return every method that needs no training: the classical ones and the shipped networks."""
-    return [*METHODS, *shipped_names()]
+    return [*METHODS, *plugins.installed(plugins.METHODS), *shipped_names()]
 
 
 def restorers(names: Sequence[str], options: RestoreOptions | None = None) -> list[Restorer]:
@@ -139,7 +210,8 @@ def weights_path(name: str) -> Path:
         )
     raise ValueError(
         f"no method {name!r}{suggest(name, (*method_names(), *NETWORKS))}; known are {', '.join(method_names())}, a "
-        ".safetensors file, a folder of `quiver train`, and in `quiver bench` its presets"
+        "Python file (mine.py:restore), a .safetensors file, a folder of `quiver train`, and in `quiver bench` its "
+        "presets"
     )
 
 

@@ -1,0 +1,1 @@
+"""Parts of one's own: two sensors, a method and a scene."""
