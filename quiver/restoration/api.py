@@ -31,9 +31,10 @@ from quiver.host import own_numbers
 from quiver.restoration.automatic import chosen
 from quiver.restoration.interface import AUTO, DEFAULT_METHOD, RestoreOptions, refuse_outside, remarks
 from quiver.restoration.restored_file import check_finite
-from quiver.restoration.sources import codes_of, refuse_idle
+from quiver.restoration.sources import chosen_of_sensed, codes_of, refuse_idle
 
-Source = Stream | Clip | str | os.PathLike[str] | Array
+Opened = Stream | Clip | Array
+Source = Opened | str | os.PathLike[str]
 
 
 @own_numbers
@@ -63,18 +64,19 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     are filled from their neighbours, as are those that a stream's description states; crosstalk and afterpulses, which
     are not inverted, warn. A network outside of what it was measured for warns; with `strict` it is a `ValueError`.
     `planes` sums so many successive frames of one bit to a code; with `exposure` that of one plane, the photons are
-    those of the sum. `qsim.PlaneSums` states which planes, too. Of arrays and imported streams without a map, hot
-    pixels are looked for, filled and told by a warning; `scan=False` leaves them. `ValueError` or `FileNotFoundError`
-    where the arguments do not fit together.
+    those of the sum. Codes of a clip that is sensed now are over so many of its frames, and `ppp` is that of a code.
+    `qsim.PlaneSums` states which planes, too. Of arrays and imported streams without a map, hot pixels are looked for,
+    filled and told by a warning; `scan=False` leaves them. `ValueError` or `FileNotFoundError` where the arguments do
+    not fit together.
 
         video = quiver.restore(stream)
     """
-    source = np.asarray(source) if isinstance(source, LazyArray) else source
+    opened = np.asarray(source) if isinstance(source, LazyArray) else _opened(source)
     if not isinstance(method, str):
         raise ValueError(f"method= is a name, a weights file or a run folder as text, got {method!r}")
     bad = None if defects is None else check_map(np.asarray(defects), "defects=")
     sums = planes if isinstance(planes, PlaneSums) else PlaneSums(planes=planes)
-    codes = summed(_codes(source, sensor, exposure, ppp), sums)
+    codes = _codes(opened, sensor, exposure, ppp, sums)
     codes = scanned(codes, scan) if bad is None else filled(codes, bad)
     runner, _ = chosen(method, codes, RestoreOptions(device=device or "auto", mode=mode or "exact"))
     refuse_idle({"device": device, "mode": mode, "method": method}, [runner])
@@ -102,30 +104,37 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     return restored
 
 
-def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: float | None) -> Codes:
+def _codes(source: Opened, sensor: Sensor | None, exposure: float | None, ppp: float | None, sums: PlaneSums) -> Codes:
+    """Return the codes of a source, summed as asked; of a clip that is sensed now over as many frames."""
     if isinstance(source, np.ndarray):
         if ppp is not None:
             raise ValueError("ppp= is for a clip that is sensed now, and an array holds codes already; leave it out")
-        return _array(source, sensor, exposure)
+        return summed(_array(source, sensor, exposure), sums)
     if sensor is not None or exposure is not None:
         raise ValueError("sensor= and exposure= are for arrays, and a clip or a stream has its own; leave them out")
-    if isinstance(source, str | os.PathLike):
-        path = Path(source)
-        if path.suffix == ".npy" and path.is_file() and not path.with_suffix(".json").is_file():
-            raise ValueError(f"{path}: a bare array; give numpy.load of it with sensor= and exposure= in seconds")
-        source = Clip.open(path) if path.is_dir() or not path.exists() else open_stream(path)
     if isinstance(source, Stream):
         if ppp is not None:
             raise ValueError("ppp= is for a clip that is sensed now, and a stream has its own light; leave it out")
-        return codes_of(source)
+        return summed(codes_of(source), sums)
     if ppp is not None:
-        return sensed(source, Illumination.of("quiver-physical", ppp, 3))[0]
+        light = Illumination.of("quiver-physical", ppp, 3).over(sums.planes)
+        return chosen_of_sensed(sensed(source, light)[0], source, light.planes, sums)
     if len(source.streams) != 1:
         there = ", ".join(source.streams) or "none"
         raise ValueError(
             f"{source.path}: give one of its streams ({there}) as clip.stream(NAME), or ppp= to sense it now"
         )
-    return stream_codes(source.stream(source.streams[0]))
+    return summed(stream_codes(source.stream(source.streams[0])), sums)
+
+
+def _opened(source: Source) -> Opened:
+    """Return the stream or clip of a path; other sources as they are. `ValueError` for a bare array."""
+    if not isinstance(source, str | os.PathLike):
+        return source
+    path = Path(source)
+    if path.suffix == ".npy" and path.is_file() and not path.with_suffix(".json").is_file():
+        raise ValueError(f"{path}: a bare array; give numpy.load of it with sensor= and exposure= in seconds")
+    return Clip.open(path) if path.is_dir() or not path.exists() else open_stream(path)
 
 
 def _array(codes: Array, sensor: Sensor | None, exposure: float | None) -> Codes:

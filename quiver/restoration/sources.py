@@ -110,10 +110,10 @@ def _of_clip(path: Path, asked: RestoreSettings, sums: PlaneSums) -> Codes:
         return summed(stream_codes(stream), sums)
     depth = asked.bits if sums.planes else _bits(asked)
     light = Illumination.of(_sensor(asked), asked.ppp, depth).over(sums.planes, asked.bits)
-    return _chosen(sensed(clip, light, asked.seed or 0)[0], clip, light.planes, sums)
+    return chosen_of_sensed(sensed(clip, light, asked.seed or 0)[0], clip, light.planes, sums)
 
 
-def _chosen(codes: Codes, clip: Clip, planes: int, sums: PlaneSums) -> Codes:
+def chosen_of_sensed(codes: Codes, clip: Clip, planes: int, sums: PlaneSums) -> Codes:
     """Return those codes of so many clip frames each that begin where `sums` says, in clip frames."""
     sums.over(len(clip), str(clip.path))  # raises: the clip has no such frames
     for name, value in (("start", sums.start), ("every", sums.every)):

@@ -10,7 +10,7 @@ import pytest
 from clips import write_clip
 
 import quiver
-from qsim import BinarySPAD
+from qsim import BinarySPAD, PlaneSums
 from quiver.cli import main
 from quiver.data.codes import sensed, stored
 from quiver.data.illumination import Illumination
@@ -39,6 +39,14 @@ def test_a_restored_clip_has_the_codes_and_the_light_of_its_evaluation(clip, cap
         assert codes.ppp == pytest.approx(2.5)
         np.testing.assert_array_equal(np.load("r.npy"), expected)
         assert (planes > 1) == (f"{planes} planes per code, 2000 planes/s" in capsys.readouterr().out)
+
+
+def test_python_senses_a_clip_over_planes_as_the_command_does(clip):
+    line = "restore c -o r.npy --method naive --bits 3 --ppp"
+    assert main([*line.split(), "2.5", "--planes", "4", "--from", "8"]) == 0
+    for source in (clip, clip.path):
+        found = quiver.restore(source, "naive", ppp=2.5, planes=PlaneSums(8, planes=4))
+        np.testing.assert_array_equal(found, np.load("r.npy"))
 
 
 def test_planes_of_a_sensed_clip_begin_where_a_code_begins(clip, capsys):
