@@ -55,7 +55,10 @@ class ClipFolder:
         manifest = path / "clip.json"
         if not manifest.is_file():
             raise FileNotFoundError(_why_not(path))
-        return cls(path, read_info(manifest))
+        state = _state(manifest)
+        found = cls(path, read_info(manifest))
+        object.__setattr__(found, "_seen", state)
+        return found
 
     def __len__(self) -> int:
         return self.info.shape[0]
@@ -212,11 +215,13 @@ class ClipFolder:
             check_crop(crop, height, width, str(self.path))
         path = self.path / frame_file(folder, t)
         try:
-            return exr.read_half(path, height, width, crop, colour=self.bands is not None, beside=self.path)
+            found = exr.read_half(path, height, width, crop, colour=self.bands is not None, beside=self.path)
         except FileNotFoundError:
             raise FileNotFoundError(
                 f"{path}: no such file; the clip is damaged, run `qsim check {self.path}`"
             ) from None
+        self._check_same()
+        return found
 
     def _truth(self, t: int, channel: str) -> Array:
         return self._channel("truth", t, channel)
@@ -239,11 +244,33 @@ class ClipFolder:
             raise FileNotFoundError(f"{path}: no such file; {why}")
         status = path.stat()
         opening.regular(path, beside=self.path)
-        return _read_truth(path, *self.shape[1:], status.st_mtime_ns, status.st_size)
+        found = _read_truth(path, *self.shape[1:], status.st_mtime_ns, status.st_size)
+        self._check_same()
+        return found
+
+    def _check_same(self) -> None:
+        """Raise `ValueError` if the folder became another clip since this one was opened."""
+        described = self.path / "clip.json"
+        try:
+            state = _state(described)
+            if state == getattr(self, "_seen", None):
+                return
+            same = read_info(described).checksums == self.info.checksums
+        except FileNotFoundError:
+            same = False
+        if not same:
+            raise ValueError(f"{described}: was replaced since it was opened; open the clip again")
+        object.__setattr__(self, "_seen", state)
 
     def _check_frame(self, t: int) -> None:
         if not 0 <= t < len(self):
             raise ValueError(f"{self.path}: frame {t} does not exist; the clip has frames 0..{len(self) - 1}")
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    """Return what tells a file from another of its name."""
+    status = path.stat()
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def _why_not(path: Path) -> str:

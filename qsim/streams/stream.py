@@ -282,10 +282,17 @@ class Stream:
             )
         return array
 
+    def _check_length(self) -> None:
+        """Raise `ValueError` if the mapped file became shorter: behind its end are zeros, or the end of the process."""
+        mapped = getattr(self.packed, "_mmap", None)  # None: a copy, after pickling
+        if mapped is not None and mapped.size() < self._bytes:
+            raise ValueError(f"{self.path}: became shorter since it was opened; sense it again and replace it")
+
     def _read(self, start: int, stop: int, crop: Crop | None) -> Array:
         """Return codes [stop - start, h, w] of frames start ... stop - 1; only the bytes of the crop are read."""
         self._existing(start, stop)
         _, height, width = self.shape
+        self._check_length()
         if crop is None:
             return packing.unpack(np.asarray(self.packed[start:stop]), self.bits, width)
         y, x, h, w = check_crop(crop, height, width, str(self.path))

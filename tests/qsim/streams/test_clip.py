@@ -1,5 +1,6 @@
 """Tests what a notebook does with clips and streams: sense, index, iterate, compare with the truth, show."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -161,6 +162,31 @@ def test_files_are_named_by_text_or_path(tmp_path: Path):
     assert np.array_equal(one.codes(), two.codes())
     description = one.path.with_suffix(".json")
     assert Stream.open(str(description)).info == Stream.open(description).info
+
+
+def test_a_clip_that_became_another_says_so(tmp_path: Path):
+    """Light of the new frames with the camera and the units of the old ones is nobody's."""
+    first = write_clip(tmp_path / "c", frames=2, height=6, width=8, seed=1)
+    light = first.radiance(0)
+    shutil.rmtree(tmp_path / "c")
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        first.radiance(0)
+    write_clip(tmp_path / "c", frames=2, height=6, width=8, seed=2)
+    for read in (lambda: first.radiance(0), lambda: first[1], lambda: first.sharp(0)):
+        with pytest.raises(ValueError, match=r"clip\.json: was replaced since it was opened; open the clip again"):
+            read()
+    shutil.rmtree(tmp_path / "c")
+    write_clip(tmp_path / "c", frames=2, height=6, width=8, seed=1)
+    np.testing.assert_array_equal(first.radiance(0), light)  # the same clip again
+
+
+def test_a_stream_that_is_cut_while_it_is_open_says_so(tmp_path: Path):
+    """A map reads zeros behind the end of its file, and ends the process a page later."""
+    stream = write_clip(tmp_path / "c", frames=3, height=6, width=8).sense("quiver-physical", ppp=3.25, bits=3)
+    assert stream[2].max() > 0
+    os.truncate(stream.path, 140)
+    with pytest.raises(ValueError, match="became shorter since it was opened"):
+        stream.codes(2, 3)
 
 
 def test_a_stream_of_another_clip_is_not_of_this_one(tmp_path: Path):
