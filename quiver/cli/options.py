@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from qsim.cli.console import note, running
-from qsim.files import check_ours
+from qsim.files import check_ours, sync_folder
 from qsim.kinds import Whole
 from qsim.settings import setting
 from quiver.evaluation.settings import EvaluateSettings
@@ -81,6 +81,8 @@ def renew(folder: Path, mark: str, ours: str) -> None:
     """
     check_ours(folder, ours)
     for path in sorted(folder.iterdir(), key=lambda path: path.name == mark):
+        if path.name == mark:
+            sync_folder(folder)  # after a power cut nothing is left without it
         if path.is_dir():
             shutil.rmtree(path)
         elif path.name != "lock":

@@ -16,7 +16,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.figures import new_figure, write_figure
-from qsim.files import load_array, replacing
+from qsim.files import load_array, replacing, sync_folder
 from quiver.data.codes import Codes, CodeTruth
 from quiver.evaluation import metrics
 
@@ -87,7 +87,9 @@ def crop_file(out: Path, light: str, clip: str, name: str) -> Path:
 
 def save_crop(path: Path, picture: Array) -> None:
     """Store a float16 picture, [h, w] or [3, h, w], in units of the peak, limited to 2: a sheet shows white there."""
-    path.parent.mkdir(exist_ok=True)
+    if not path.parent.is_dir():
+        path.parent.mkdir(exist_ok=True)
+        sync_folder(path.parent.parent)  # the row that says that the crops are there is synced after it
     with replacing(path) as file:
         np.save(file, np.minimum(picture, 2).astype(np.float16))
 

@@ -22,7 +22,7 @@ import torch
 from torch import nn
 
 from qsim.figures import new_figure, write_figure
-from qsim.files import Blocked, Damaged, check_ours, read_json, write_bytes, write_json
+from qsim.files import Blocked, Damaged, check_ours, read_json, sync_folder, write_bytes, write_json
 from qsim.locks import Lock
 from quiver.device import random_states, set_random_states
 from quiver.evaluation.json_values import json_safe
@@ -79,6 +79,8 @@ def alone_in(folder: Path, doing: str) -> Iterator[None]:
 def empty(folder: Path) -> None:
     """Remove all but the lock, which the caller holds; settings.json last, so that the folder stays recognisable."""
     for path in sorted(folder.iterdir(), key=lambda path: path.name == "settings.json"):
+        if path.name == "settings.json":
+            sync_folder(folder)  # after a power cut nothing is left without it
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         elif path.name != LOCK:
