@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from qsim import files, records
+from qsim.parsing import unreadable
 
 FORMAT_VERSION = 1  # of clips, streams, data sets and restored videos; only this one is read
 Made = TypeVar("Made")
@@ -19,7 +20,10 @@ Made = TypeVar("Made")
 
 def values_of(record: Any) -> dict[str, Any]:
     """Return what the file of a record holds."""
-    return sealed({"format_version": FORMAT_VERSION} | _kind(type(record)) | records.plain(record))
+    values = {"format_version": FORMAT_VERSION} | _kind(type(record)) | records.plain(record)
+    if problem := unreadable(values):
+        raise ValueError(f"a description holds {problem}, which no reader accepts")
+    return sealed(values)
 
 
 def write(path: Path, record: Any) -> str:

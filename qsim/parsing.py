@@ -60,6 +60,12 @@ def parse_json(path: Path, text: str) -> dict[str, Any]:
     return value
 
 
+def unreadable(value: Any) -> str:
+    """Return why `parse_json` would refuse a value once it is stored; empty if it would not."""
+    problem = _too_much([value], "")
+    return problem[1] if problem else ""
+
+
 class _NotFinite(ValueError):
     """NaN or infinity in JSON."""
 

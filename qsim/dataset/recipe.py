@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from qsim import checks, files, plugins, records
+from qsim import checks, files, opening, plugins, records
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.clip_info import ClipInfo
 from qsim.dataset.job import Job
@@ -100,10 +100,7 @@ def text_of(path: str | Path) -> tuple[Path, str]:
                 f"{path}: no such recipe{checks.suggest(str(path), RECIPES)}; give a .toml file, or one of {known}"
             )
         found = RECIPES[str(path)]
-    try:
-        return found, found.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: not a text file; a recipe is TOML in UTF-8") from None
+    return found, opening.text(found, "recipe")
 
 
 def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:

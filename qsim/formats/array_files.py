@@ -7,7 +7,6 @@ whose value is not a code. Streams of bits without a shape: raw_cameras.py.
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -34,6 +33,7 @@ from qsim.formats.recording import (
     reached,
     white_of,
 )
+from qsim.parsing import parse_json
 from qsim.sensor import packing
 
 _ZARR_METADATA = ("zarr.json", ".zarray", ".zattrs", ".zgroup", ".zmetadata")
@@ -209,11 +209,11 @@ def _zarr_codecs(path: Path, folder: Path) -> set[str]:
     described = [folder / name for name in ("zarr.json", ".zarray") if (folder / name).is_file()]
     for file in [*described, *(path / name for name in ("zarr.json", ".zattrs", ".zgroup")), folder / ".zattrs"]:
         if file.is_file():
-            opening.regular(file, "description", most=limits.METADATA, beside=path)
+            parse_json(file, opening.text(file, "description", most=limits.METADATA))
     found: set[str] = set()
     for file in described:
         with decoding_errors(file, "JSON"):
-            content = json.loads(opening.text(file))
+            content = parse_json(file, opening.text(file))
             waiting = [content[key] for key in ("codecs", "filters", "compressor") if key in content]
             while waiting:
                 item = waiting.pop()
@@ -244,7 +244,7 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     if not description.is_file():
         raise FileNotFoundError(f"{path}: has no transforms.json; a recording of visionsim is a folder with one")
     with decoding_errors(description, "JSON"):
-        info = json.loads(opening.text(description))
+        info = parse_json(description, opening.text(description))
         width = int(info["w"])
         packed = bool(info.get("bitpack", "bitpack_dim" in info or info.get("bitplanes", 1) == 1))
         planes = None if info.get("bitplanes") is None else int(info["bitplanes"])

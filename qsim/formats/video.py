@@ -168,7 +168,7 @@ def _open_video(path: Path) -> Any:
     """Open a container; files that name other files (playlists) and frames above limits.PIXELS are refused."""
     import av
 
-    opening.regular(path)
+    opening.regular(path, most=limits.ASSET if path.suffix.lower() == ".gif" else None)  # FFmpeg reads it to the end
     container = av.open(files.native(path), options={"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"})
     for stream in container.streams.video:
         stream.codec_context.options = {"max_pixels": str(limits.PIXELS)}

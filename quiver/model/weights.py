@@ -36,7 +36,7 @@ def read_torch(path: Path, device: torch.device | str = "cpu") -> Any:
     Nothing in the file is executed. A zip whose parts claim more bytes than the file has is refused before it is
     read, because torch does not compress.
     """
-    opening.regular(path, "checkpoint")
+    opening.regular(path, "checkpoint", most=limits.WEIGHTS)
     try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
@@ -144,7 +144,7 @@ def _build(kind: str, values: dict[str, object]) -> nn.Module:
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Return tensors of any shape and metadata; FileNotFoundError or ValueError for any other file."""
-    opening.regular(path, "weights file")
+    opening.regular(path, "weights file", most=limits.WEIGHTS)
     try:
         with safe_open(path, framework="pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118

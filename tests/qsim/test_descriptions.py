@@ -23,6 +23,7 @@ from qsim.formats import exporting, importing
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints
 from qsim.report import report, views
+from qsim.restored_video import RestoredInfo
 from qsim.streams.clip import Clip
 from qsim.streams.sensing import Sensing
 from qsim.streams.storing import replay, sense
@@ -232,3 +233,11 @@ def test_a_byte_order_mark_is_skipped(tmp_path):
     toml.write_text(fakes.RECIPE, encoding="utf-8-sig")
     assert files.read_toml(toml, "file") == tomllib.loads(fakes.RECIPE)
     assert recipe.load(toml).jobs == recipe.parse(fakes.RECIPE, toml).jobs
+
+
+def test_what_no_reader_accepts_is_not_written(tmp_path: Path):
+    video = RestoredInfo(method="moment", seconds_per_frame=0.1)
+    object.__setattr__(video, "device", {"deep": 1 << 64})
+    with pytest.raises(ValueError, match="a description holds a whole number of more than 64 bits"):
+        descriptions.write(tmp_path / "v.json", video)
+    assert not list(tmp_path.iterdir())

@@ -438,6 +438,13 @@ def test_zarrs_that_promise_more_than_there_is(tmp_path: Path):
     assert peak_memory() - before < MEMORY
 
 
+def test_attributes_of_a_zarr_that_no_description_holds(tmp_path: Path):
+    """They became a stream that nothing opens."""
+    folder = described_zarr(tmp_path / "large", attributes={"fps": 10**30})
+    with pytest.raises(ValueError, match=r"zarr\.json: not readable as JSON \(a whole number of more than 64 bits"):
+        importing.read(folder, Hints("zarr"))
+
+
 @pytest.mark.parametrize("codec", ["pickle", "numcodecs.pickle", "bz2", "lzma", "json2"])
 def test_zarr_codecs_that_execute_or_expand_are_refused(tmp_path: Path, codec: str):
     codecs = [{"name": "bytes"}, {"name": "sharding_indexed", "configuration": {"codecs": [{"name": codec}]}}]
