@@ -212,7 +212,7 @@ def _published_test(asked: EvaluateSettings) -> Comparison:
 
 def _run_static(asked: EvaluateSettings, sums: PlaneSums, methods: Sequence[Any]) -> int:
     from quiver.data.clips import peak_of
-    from quiver.data.photon_counts import read_counts, read_planes
+    from quiver.data.photon_counts import is_stored, read_counts, read_planes
     from quiver.evaluation.json_values import json_safe
     from quiver.evaluation.static_object import FORMAT, counted, evaluate_static, markdown
 
@@ -223,7 +223,7 @@ def _run_static(asked: EvaluateSettings, sums: PlaneSums, methods: Sequence[Any]
         raise ValueError("--bits: measured counts are clipped to one depth; give one number")
     if not asked.static.is_file():
         raise FileNotFoundError(f"{asked.static}: no such file")
-    planes = sums.any or asked.width is not None
+    planes = sums.any or asked.width is not None or is_stored(asked.static)
     counts = read_planes(asked.static, sums, asked.width) if planes else read_counts(asked.static)
     if counts.sums is not None and asked.bits is not None:
         raise ArgumentError("bits", f"sums of {counts.sums.planes} planes are not clipped; leave it out")

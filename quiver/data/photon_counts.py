@@ -15,6 +15,7 @@ from qsim.checks import ArgumentError
 from qsim.files import decoding_errors, load_array, read_npy
 from qsim.plane_sums import PlaneSums, Sums
 from qsim.streams.sensing import Sensing
+from qsim.streams.stream import is_stream
 from quiver.data.codes import codes_of, open_stream, summed
 from quiver.data.illumination import Illumination, ideal_clocked
 from quiver.data.photon_cubes import cube_codes
@@ -47,6 +48,12 @@ def arrivals(mean: Array, planes: int, frames: int) -> Array:
     return np.asarray(-planes * np.log1p(-fired))
 
 
+def is_stored(path: Path) -> bool:
+    """Return whether a file is a stored stream, whose description states what its codes are."""
+    side = path.with_suffix(".json")
+    return path.suffix in (".npy", ".json") and side.is_file() and is_stream(side)
+
+
 def read_planes(path: Path, sums: PlaneSums, width: int | None) -> Counts:
     """Return sums of the binary planes of a static object, of an ideal clocked SPAD: of a stream, or of a .npy.
 
@@ -54,7 +61,7 @@ def read_planes(path: Path, sums: PlaneSums, width: int | None) -> Counts:
     [T, H, ceil(W/8)]. The share of a frame is
     its light over that of the mean frame, to first order. `ValueError` for values of several bits.
     """
-    if path.with_suffix(".json").is_file() and path.suffix in (".npy", ".json"):
+    if is_stored(path):
         if width is not None:
             raise ArgumentError("width", f"{path} is a stored stream, which has its own (see its .json); leave it out")
         codes = summed(codes_of(open_stream(path)), sums)
