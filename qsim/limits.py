@@ -36,6 +36,7 @@ WHOLE = _limit(1 << 64, "", "a whole number in JSON and TOML, which stays below"
 SCENE_FILES = _limit(10_000, "files", "a scene, with all that it names")
 ASSET = _limit(1 << 31, "bytes", "a mesh, a picture or another file that a scene names")
 VERTICES = _limit(5_000_000, "vertices", "a mesh file")
+BODIES = _limit(10_000, "bodies", "a glTF scene")
 TEXELS = _limit(1 << 27, "pixels", "all pictures of a mesh file")
 PIXELS = _limit(1 << 26, "pixels", "a frame, a page or a picture")
 CHUNK = _limit(1 << 29, "bytes", "a chunk of HDF5 or zarr, in memory")

@@ -10,6 +10,7 @@ import importlib.util
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -70,13 +71,21 @@ RECIPES = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.toml
 
 
 def load(
-    name: str | Path, seed: int = 0, speed: float = 1.0, *, along_path: bool = False, bands: str | None = None
+    name: str | Path,
+    seed: int = 0,
+    speed: float = 1.0,
+    *,
+    along_path: bool = False,
+    bands: Literal["rgb"] | None = None,
+    camera: str | None = None,
+    start: float | None = None,
 ) -> Scene:
     """Return the scene of a family, a .py file with `scene(seed, *, speed)`, a folder of assets, glTF or Mitsuba XML.
 
     `asset_folder.py` states what a folder may hold, `gltf_file.py` what becomes of an animated .glb or .gltf. An XML
     scene stands still and has no seed: a Python file that calls `qsim.read_mitsuba` moves its shapes. With
-    `bands="rgb"` an XML scene is read in colour; others are coloured afterwards (colours.py).
+    `bands="rgb"` an XML scene, or a glTF file with a camera, is read in colour; others are coloured afterwards
+    (colours.py). `camera` names one of a glTF file, and `start` [s] is the time of its animations at t = 0.
     `FileNotFoundError` for a missing file; `ValueError` for a name that is none of these, for a speed outside 0.001
     to 1000, and for one other than 1 that changes no motion of a .py or .xml scene, unless its camera will move
     `along_path`, on which the speed acts.
@@ -84,6 +93,7 @@ def load(
     convert(float(speed), Speed, "speed")
     if name == "":
         raise ValueError("scene '': name a family, a file or a folder; '.' is the present folder")
+    check_view(name, camera, start)
     if str(name) in FAMILIES:
         return FAMILIES[str(name)](seed, speed=speed)
     if str(name).endswith(".py"):
@@ -95,10 +105,17 @@ def load(
 
         return read_mitsuba(name, bands=bands)
     if str(name).endswith(GLTF_SUFFIXES):
-        return gltf_file.scene(seed, speed=speed, file=name)
+        return gltf_file.scene(seed, speed=speed, file=name, camera=camera, start=start or 0.0, bands=bands)
     if Path(name).is_dir() and not (Path(name) / "clip.json").is_file():
         return asset_folder.scene(seed, speed=speed, folder=name)
     raise ValueError(_no_scene(name))
+
+
+def check_view(name: str | Path, camera: str | None, start: float | None) -> None:
+    """Raise `ValueError` for a camera or a start that a scene of this name cannot have: one that is no glTF file."""
+    for word, value in (("camera", camera), ("start", start)):
+        if value is not None and not str(name).endswith(GLTF_SUFFIXES):
+            raise ValueError(f"{name}: {word} is for .glb and .gltf files; leave it out")
 
 
 def _of_program(path: Path, seed: int, speed: float, along_path: bool) -> Scene:

@@ -26,7 +26,7 @@ class Render:
     scene: Annotated[
         str,
         setting(
-            "a family of scenes/, a .py file with scene(seed, speed=...), an animated .glb, Mitsuba .xml, a folder",
+            "a family of scenes/, a .py file with scene(seed, speed=...), a .glb or .gltf, Mitsuba .xml, a folder",
             positional=True,
             known=families,
         ),
@@ -84,10 +84,10 @@ def render(asked: Render, settings: RenderSettings) -> int:
         name: getattr(settings, name) for name in ("frames", "frame_rate", "shutter", "psnr", "reuse")
     }
     size = {"speed": asked.speed} | {
-        name: getattr(settings, name) for name in ("height", "width", "bands", "camera_path")
+        name: getattr(settings, name) for name in ("height", "width", "bands", "camera_path", "camera", "start")
     }
     if asked.output is None:
-        scene, _ = scene_rendering.load_scene(asked.scene, **size, seed=asked.seed, frame_rate=settings.frame_rate)
+        scene, _ = scene_rendering.load_scene(asked.scene, asked.seed, asked.speed, settings)
         light = None if asked.ppp is None else asked.ppp / planes
         chosen = choose_budget(scene, **taken | {"ppp": light}, planes=planes, codes=(planes,))
         output({"render": dataclasses.asdict(chosen)}, explain(chosen.findings))
@@ -104,7 +104,8 @@ def render(asked: Render, settings: RenderSettings) -> int:
     text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
     text += f", {clip.mean_photons:.4g} photons per pixel"
     if asked.scene.endswith(GLTF_SUFFIXES):
-        text += f"\n{played(scenes.load(asked.scene, asked.seed, asked.speed))}"
+        shown = scenes.load(asked.scene, asked.seed, asked.speed, camera=settings.camera, start=settings.start)
+        text += f"\n{played(shown, asked.scene)}"
     text += "" if found is None else f"\nerror: {found.line}"
     text += (missed := shortfall(found, settings.psnr)) and f"\nerror: {missed}"
     if info.fireflies_per_frame:

@@ -80,14 +80,24 @@ def load_scene(job: Job) -> Scene:
 def load_traced(job: Job) -> tuple[Scene, dict[str, str]]:
     """Return the job's scene at its size, and the SHA-256 of each file of the user that it read."""
     from qsim.dataset import scene_files
-    from qsim.dataset.scene_rendering import along_path, in_bands
+    from qsim.dataset.scene_rendering import along_path, in_bands, in_colour
 
     settings = job.settings
     moved = settings.camera_path is not None
     size = settings.size
-    scene, read = scene_files.load(job.family, job.scene_seed, job.speed, along_path=moved, bands=settings.bands)
+    scene, read = scene_files.load(
+        job.family,
+        job.scene_seed,
+        job.speed,
+        along_path=moved,
+        bands=settings.bands,
+        camera=settings.camera,
+        start=settings.start,
+    )
+    coloured = in_colour(scene, job.family)
     scene = along_path(scene, settings.camera_path, settings.frame_rate, size, job.speed)
-    return in_bands(scene.resized(*size), settings.bands), read
+    sized = scene.resized(*size)
+    return sized if coloured else in_bands(sized, settings.bands), read
 
 
 def render_seed(job: Job) -> int:

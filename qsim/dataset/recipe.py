@@ -42,6 +42,7 @@ from qsim.optics.radiometry import RGB
 from qsim.parsing import parse_toml
 from qsim.rendering.render_settings import RenderSettings
 from qsim.scene.animated.gltf_body import GLTF_SUFFIXES, animated_file, animations_in
+from qsim.scene.animated.gltf_scene import cameras_in
 from qsim.scene.camera_path import PLAIN, read_camera_path
 from qsim.settings import settings_of
 from qsim.streams.preparation import prepare
@@ -131,8 +132,13 @@ def _place(path: Path, place: str) -> Iterator[None]:
 
 def _jobs_of(section: ScenesSection, head: Head, seed: int, streams: tuple[Sensing, ...], beside: Path) -> JobSeries:
     """Return the jobs of a section [[scenes]], one per seed and speed."""
+    from qsim import scenes
+
     settings = _settings_of(section, head, beside)
     family = _family(section.family, beside)
+    scenes.check_view(family, settings.camera, settings.start)
+    if family.endswith(GLTF_SUFFIXES):
+        _check_gltf(family, settings)
     speeds = tuple(_several(section.speed, "speed"))
     if family.endswith(".xml") and speeds != (1.0,) and settings.camera_path is None:
         raise ValueError("an .xml scene has no motion, so speed changes nothing; leave it out")
@@ -205,10 +211,6 @@ def _family(family: str, beside: Path) -> str:
     if family.endswith((".py", ".xml", *GLTF_SUFFIXES)):
         if not file.is_file():
             raise ValueError(f"family: no such scene file {file}")
-        if family.endswith(GLTF_SUFFIXES):
-            names: list[str | None] = [*animations_in(file)]
-            for name in names or [None]:
-                animated_file(file, animation=name)
         return str(file)
     from qsim.scenes import FAMILIES
 
@@ -216,6 +218,18 @@ def _family(family: str, beside: Path) -> str:
         meant = f"{family!r}{checks.suggest(family, FAMILIES)}; there are: {', '.join(sorted(FAMILIES))}"
         raise ValueError(f"unknown family {meant}")
     return family
+
+
+def _check_gltf(file: str, settings: RenderSettings) -> None:
+    """Read a glTF file as its scenes will; errors as of its readers."""
+    from qsim import scenes
+
+    if cameras_in(file):
+        scenes.load(file, camera=settings.camera, start=settings.start)
+        return
+    names: list[str | None] = [*animations_in(file)]
+    for name in names or [None]:
+        animated_file(file, animation=name)
 
 
 def _streams_of(source: RecipeFile, seed: int, path: Path) -> dict[Sensing, str]:

@@ -8,6 +8,7 @@
       reads = ["numbers.txt", "meshes/*.obj"]
 
   With a pattern the names of all files that match it count, too: another mesh may be the one that a seed picks.
+* glTF: the file, and the buffers and pictures that it names.
 * Mitsuba XML: each file that an attribute names, in this file and in those that it includes.
 * A folder of assets: every file in it.
 
@@ -25,12 +26,14 @@ import sys
 import sysconfig
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from xml.etree import ElementTree
 
 from qsim import files, limits, opening, scenes
 from qsim.dataset.provenance import nested
 from qsim.scene import Scene
+from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
+from qsim.scene.animated.gltf_buffers import files_of
 
 _INSTALLED = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
 _LEFT_OUT = tuple(f"{os.path.realpath(folder)}{os.sep}" for folder in (*_INSTALLED, str(Path(__file__).parents[1])))
@@ -41,23 +44,33 @@ _PARTS_LEFT_OUT = frozenset({".cache", "site-packages", "dist-packages", "__pyca
 
 
 def load(
-    family: str | Path, seed: int = 0, speed: float = 1.0, *, along_path: bool = False, bands: str | None = None
+    family: str | Path,
+    seed: int = 0,
+    speed: float = 1.0,
+    *,
+    along_path: bool = False,
+    bands: Literal["rgb"] | None = None,
+    camera: str | None = None,
+    start: float | None = None,
 ) -> tuple[Scene, dict[str, str]]:
     """Load a scene as `scenes.load` does, with the SHA-256 of each file read; empty for a family of the library.
 
     `ValueError` for a Python file whose `reads` is no list of texts, or names a file that does not exist.
     """
+    view: dict[str, Any] = {"along_path": along_path, "bands": bands, "camera": camera, "start": start}
     path = Path(family).resolve()
     if str(family) in scenes.FAMILIES or not path.exists():
-        return scenes.load(family, seed, speed, along_path=along_path, bands=bands), {}
+        return scenes.load(family, seed, speed, **view), {}
     declared = _declared(path) if path.suffix == ".py" else {}
     known = set(sys.modules)
-    scene = scenes.load(family, seed, speed, along_path=along_path, bands=bands)
+    scene = scenes.load(family, seed, speed, **view)
     if path.is_dir():
         found = {file for file in path.rglob("*") if file.is_file()}
         return scene, {_name(file, path): _digest(file) for file in sorted(found)}
     if path.suffix == ".xml":
         found = of_xml(path)
+    elif path.suffix in GLTF_SUFFIXES:
+        found = {path, *files_of(path)}
     else:
         found = {path, *_imported(path), *_named_in(scene)}
         _forget(set(sys.modules) - known)

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+from qsim import scenes
 from qsim.clip.clip_info import Origin
 from qsim.clip.manifest import target_of
 from qsim.dataset import scene_files
@@ -22,6 +23,8 @@ from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.fidelity import choose_budget
 from qsim.rendering.render_settings import SIDE, RenderSettings
 from qsim.scene import Scene
+from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
+from qsim.scene.animated.gltf_scene import cameras_in
 from qsim.scene.camera_path import read_camera_path
 from qsim.scenes.colours import coloured
 from qsim.streams.clip import Clip
@@ -44,6 +47,8 @@ def render(  # noqa: PLR0913 (settings of a public function)
     planes: int = 1,
     bands: Literal["rgb"] | None = None,
     camera_path: str | os.PathLike[str] | None = None,
+    camera: str | None = None,
+    start: float | None = None,
     reuse: bool | None = None,
     budget: Budget | None = None,
     progress: Progress | None = None,
@@ -51,16 +56,18 @@ def render(  # noqa: PLR0913 (settings of a public function)
 ) -> Clip:
     """Render a scene at a stated error and return its clip: radiance, sharp frames and ground truth.
 
-    `scene` is a `Scene`, or what `qsim render` takes: a family, a .py file with `scene(seed, *, speed)`, an animated
-    .glb or .gltf, Mitsuba .xml, or a folder of assets. `height` and `width` [px] default to the camera of a `Scene` and
-    to 128 of all others. `seed` is that of the scene and of its samples; `speed` is a factor on all motions (default
-    1). `frame_rate` is in frames per second, `shutter` the open fraction of a frame, 0 for sharp frames. `psnr` [dB] is
-    the requested error, `ppp` the brightest light that will be sensed [photons per pixel and code] (`choose_budget`); a
-    `budget` decides both instead. Of frames that codes will sum as `planes`, a code has that error. `bands="rgb"` gives
-    a scene of one band colours (scenes/colours.py) and renders red, green and blue. `camera_path` is a transforms.json
-    whose view, distortion and poses replace those of the scene's camera; a file that states no rate has one pose per
-    frame (qsim/scene/camera_path.py). `reuse` True lets sharp frames share samples with their neighbours where that is
-    predicted to cost less, None only where a trial costs little against the clip, False never.
+    `scene` is a `Scene`, or what `qsim render` takes: a family, a .py file with `scene(seed, *, speed)`, a .glb or
+    .gltf with a camera or an animation, Mitsuba .xml, or a folder of assets. `height` and `width` [px] default to the
+    camera of a `Scene` and to 128 of all others; one side of a file with a camera gives the other. `seed` is that of
+    the scene and of its samples; `speed` is a factor on all motions (default 1). `frame_rate` is in frames per second,
+    `shutter` the open fraction of a frame, 0 for sharp frames. `psnr` [dB] is the requested error, `ppp` the brightest
+    light that will be sensed [photons per pixel and code] (`choose_budget`); a `budget` decides both instead. Of frames
+    that codes will sum as `planes`, a code has that error. `bands="rgb"` gives a scene of one band colours
+    (scenes/colours.py) and renders red, green and blue. `camera_path` is a transforms.json whose view, distortion and
+    poses replace those of the scene's camera; a file that states no rate has one pose per frame
+    (qsim/scene/camera_path.py). `camera` names a camera of a glTF file, else the seed chooses it, and `start` [s] is
+    the time of its animations at the first frame. `reuse` True lets sharp frames share samples with their neighbours
+    where that is predicted to cost less, None only where a trial costs little against the clip, False never.
 
     `path` is the folder of the clip; an equal call resumes an interrupted one. Without it, the clip lies in a temporary
     folder that is deleted after the last use of the clip and its streams. `progress(done, frames)` is called after each
@@ -74,10 +81,22 @@ def render(  # noqa: PLR0913 (settings of a public function)
         raise ValueError("planes= is part of the choice of a budget, and budget= replaces it; give one of them")
     if budget is not None and reuse is not None:
         raise ValueError("reuse= is part of the choice of a budget, and budget= replaces it; give one of them")
-    RenderSettings(frames=frames, frame_rate=frame_rate, shutter=shutter, psnr=psnr, reuse=reuse)  # checks them
+    settings = RenderSettings(
+        frames=frames,
+        height=height,
+        width=width,
+        frame_rate=frame_rate,
+        shutter=shutter,
+        psnr=psnr,
+        bands=bands,
+        camera_path=None if camera_path is None else os.fspath(camera_path),
+        camera=camera,
+        start=start,
+        reuse=reuse,
+    )
     if path is not None:
         target_of(path, force)  # before the pilot
-    loaded, read = load_scene(scene, height, width, seed, speed, bands, camera_path, frame_rate)
+    loaded, read = load_scene(scene, seed, speed, settings)
     if budget is None:
         budget = choose_budget(
             loaded,
@@ -109,29 +128,38 @@ def render(  # noqa: PLR0913 (settings of a public function)
 
 
 def load_scene(
-    scene: Scene | str | os.PathLike[str],
-    height: int | None,
-    width: int | None,
-    seed: int,
-    speed: float | None,
-    bands: Literal["rgb"] | None = None,
-    camera_path: str | os.PathLike[str] | None = None,
-    frame_rate: float = RenderSettings.frame_rate,
+    scene: Scene | str | os.PathLike[str], seed: int, speed: float | None, settings: RenderSettings
 ) -> tuple[Scene, dict[str, str]]:
     """Return a scene in its size, and the SHA-256 of each file that it reads; arguments and errors as of `render`."""
-    RenderSettings(height=height, width=width, frame_rate=frame_rate, bands=bands)  # refuses what does not fit
+    height, width, bands, path = settings.height, settings.width, settings.bands, settings.camera_path
     if isinstance(scene, Scene):
         if speed is not None:
             raise ValueError(f"scene {scene.name}: a Scene has its motions already; leave speed= out")
+        scenes.check_view(scene.name, settings.camera, settings.start)
         size = height or scene.camera.height, width or scene.camera.width
-        return in_bands(along_path(scene, camera_path, frame_rate, size).resized(*size), bands), {}
+        return in_bands(along_path(scene, path, settings.frame_rate, size).resized(*size), bands), {}
+    name = os.fspath(scene)
     factor = 1.0 if speed is None else speed
-    loaded, read = scene_files.load(os.fspath(scene), seed, factor, along_path=camera_path is not None, bands=bands)
-    size = size_of(loaded, height, width)
-    if loaded.file is not None and camera_path is None:
+    loaded, read = scene_files.load(
+        name,
+        seed,
+        factor,
+        along_path=path is not None,
+        bands=bands,
+        camera=settings.camera,
+        start=settings.start,
+    )
+    framed = name.endswith(GLTF_SUFFIXES) and bool(cameras_in(name))
+    size = size_of(loaded, height, width, framed=framed)
+    if loaded.file is not None and path is None:
         _warn_of_another_view(loaded, size)
-    seen = along_path(loaded, camera_path, frame_rate, size, factor).resized(*size)
-    return in_bands(seen, bands), read
+    seen = along_path(loaded, path, settings.frame_rate, size, factor).resized(*size)
+    return seen if in_colour(loaded, name) else in_bands(seen, bands), read
+
+
+def in_colour(scene: Scene, name: str) -> bool:
+    """Return whether a scene was read in the colours of its file, of Mitsuba or of glTF."""
+    return scene.bands is not None and (scene.file is not None or name.endswith(GLTF_SUFFIXES))
 
 
 def _warn_of_another_view(scene: Scene, size: tuple[int, int]) -> None:
@@ -147,16 +175,19 @@ def _warn_of_another_view(scene: Scene, size: tuple[int, int]) -> None:
         )
 
 
-def size_of(scene: Scene, height: int | None, width: int | None) -> tuple[int, int]:
+def size_of(scene: Scene, height: int | None, width: int | None, *, framed: bool = False) -> tuple[int, int]:
     """Return (height, width) [px] of the frames: what is asked, else of a Mitsuba file its film's, else SIDE.
 
-    One side alone keeps the shape of a Mitsuba file's film.
+    One side alone keeps the shape of a Mitsuba file's film, or with `framed` that of the scene's camera, which then is
+    SIDE high where no side is asked.
     """
-    if scene.file is None:
-        return SIDE if height is None else height, SIDE if width is None else width
     film = scene.camera
+    if scene.file is None and not framed:
+        return SIDE if height is None else height, SIDE if width is None else width
     if height is None and width is None:
-        return film.height, film.width
+        if not framed:
+            return film.height, film.width
+        height = SIDE
     if height is None:
         assert width is not None
         return max(1, round(width * film.height / film.width)), width
@@ -182,7 +213,7 @@ def along_path(
 
 def in_bands(scene: Scene, bands: Literal["rgb"] | None) -> Scene:
     """Return a scene as it is, or for "rgb" in colour. `ValueError` for a scene that has bands already."""
-    if bands is None or (scene.file is not None and scene.bands is not None):  # the file was read in colour
+    if bands is None:
         return scene
     return coloured(scene)
 

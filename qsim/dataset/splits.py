@@ -11,9 +11,11 @@ from typing import NamedTuple
 
 from qsim.dataset.job import clip_name, speed_suffix
 from qsim.dataset.jobs import JobSeries
+from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
+from qsim.scene.animated.gltf_scene import cameras_in
 
 SPLIT_CURE = "splits are by scene, at any speed: give one of them other seeds"
-XML_CURE = "an .xml scene is the same scene at every seed: leave one of them out"
+FILE_CURE = "the file is the same scene at every seed: leave one of them out"
 
 
 class Run(NamedTuple):
@@ -32,7 +34,7 @@ def check_sections(sections: Sequence[JobSeries]) -> None:
         _check_speeds(section, number)
     for stem, numbers in stems.items():
         splits = {sections[number].example.split for number in numbers}
-        if len(splits) > 1 and sections[numbers[0]].example.family.endswith(".xml"):
+        if len(splits) > 1 and _is_one_scene(sections[numbers[0]].example.family):
             _refuse_same(sections, numbers, stem)
         for one, other in _overlapping(sections, numbers):
             _check_pair(sections, one, other)
@@ -42,6 +44,11 @@ def check_sections(sections: Sequence[JobSeries]) -> None:
                 f"scenes[{number}]: family {stem} is in the splits '{sections[number].example.split}' and 'test'; the "
                 "test split holds families that training never sees: move its scenes"
             )
+
+
+def _is_one_scene(family: str) -> bool:
+    """Return whether a family has the same bodies at every seed: a file with a scene and its camera."""
+    return family.endswith(".xml") or (family.endswith(GLTF_SUFFIXES) and bool(cameras_in(family)))
 
 
 def _check_speeds(section: JobSeries, number: int) -> None:
@@ -57,7 +64,7 @@ def _refuse_same(sections: Sequence[JobSeries], numbers: Sequence[int], stem: st
     first = sections[numbers[0]].example.split
     number = next(number for number in numbers if sections[number].example.split != first)
     split = sections[number].example.split
-    raise ValueError(f"scenes[{number}]: scene {stem} is in the splits '{first}' and '{split}'; {XML_CURE}")
+    raise ValueError(f"scenes[{number}]: scene {stem} is in the splits '{first}' and '{split}'; {FILE_CURE}")
 
 
 def _check_pair(sections: Sequence[JobSeries], one: Run, other: Run) -> None:

@@ -131,7 +131,7 @@ def choose_budget(  # noqa: PLR0913 (settings of a public function)
     share = math.sqrt(1 - min(strict.fraction(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
     noise = Noise.of(halves, allowed.white).times(pilot.unevenness(instants))
     needed = _Work(bounces, instants, frames, share, allowed, noise)
-    found = _shared_or_alone(pilot, needed, denoise, reuse if summed == 1 else False)
+    found = _shared_or_alone(pilot, needed, denoise, reuse if summed == 1 and not scene.see_through else False)
     chosen = found.chosen
     dimmed = dimming(full, cut)
     pixels = scene.camera.height * scene.camera.width

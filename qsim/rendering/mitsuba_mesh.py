@@ -14,11 +14,23 @@ from qsim.scene import Mesh
 POSITIONS = "vertex_positions"
 NORMALS = "vertex_normals"
 TEXCOORDS = "vertex_texcoords"
+COLOURS = "vertex_color"  # an attribute, which Mitsuba wants to begin with vertex_
 FACES = "faces"
 
 
-def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any, faces: range | None = None) -> Any:
-    """Return a Mitsuba mesh with these vertices [V, 3] in m, of all or some faces; `properties` holds its bsdf."""
+def mesh_shape(
+    mi: Any,
+    mesh: Mesh,
+    name: str,
+    vertices: Array,
+    properties: Any,
+    faces: range | None = None,
+    colours: Array | None = None,
+) -> Any:
+    """Return a Mitsuba mesh with these vertices [V, 3] in m, of all or some faces; `properties` holds its bsdf.
+
+    `colours` [V, 1 or 3] of the vertices become the attribute COLOURS.
+    """
     used = vertices_of(mesh, faces)
     shown = mesh.faces
     uv = mesh.uv
@@ -35,6 +47,8 @@ def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any,
         props=properties,
     )
     shape.set_id(name)
+    if colours is not None:
+        shape.add_attribute(COLOURS, colours.shape[1], colours[used].astype(np.float32).ravel())
     parameters = mi.traverse(shape)
     parameters[POSITIONS] = vertices[used].astype(np.float32).ravel()
     parameters[FACES] = shown.astype(np.uint32).ravel()
@@ -44,7 +58,7 @@ def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any,
         parameters.update()
     if mesh.smooth:
         # Mitsuba sums normals over faces in parallel, in an order that changes from run to run.
-        parameters[NORMALS] = vertex_normals(vertices, mesh.faces)[used].ravel()
+        parameters[NORMALS] = vertex_normals(vertices, mesh.faces, mesh.groups)[used].ravel()
         parameters.update()
     return shape
 
@@ -54,8 +68,11 @@ def vertices_of(mesh: Mesh, faces: range | None) -> Any:
     return slice(None) if faces is None else np.unique(mesh.faces[faces.start : faces.stop])
 
 
-def vertex_normals(vertices: Array, faces: Array) -> Array:
-    """Return unit normals, float32 [V, 3]: face normals weighted by corner angle, summed in a fixed order."""
+def vertex_normals(vertices: Array, faces: Array, groups: Array | None = None) -> Array:
+    """Return unit normals, float32 [V, 3]: face normals weighted by corner angle, summed in a fixed order.
+
+    Vertices of one number in `groups` [V] have one normal, of all their faces.
+    """
     corners = np.asarray(vertices, np.float64)[faces]  # [F, 3, 3]
     edges = np.roll(corners, -1, axis=1) - corners
     face = np.cross(edges[:, 0], -edges[:, 2])
@@ -63,6 +80,8 @@ def vertex_normals(vertices: Array, faces: Array) -> Array:
     unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
     angles = np.arccos(np.clip(-np.einsum("fik,fik->fi", unit, np.roll(unit, 1, axis=1)), -1, 1))
     summed = np.zeros((len(vertices), 3))
-    np.add.at(summed, faces, angles[..., None] * face[:, None])
+    np.add.at(summed, faces if groups is None else groups[faces], angles[..., None] * face[:, None])
+    if groups is not None:
+        summed = summed[groups]
     length = np.linalg.norm(summed, axis=1, keepdims=True)
     return np.where(length > 0, summed / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)).astype(np.float32)

@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.colour import luminance
 from qsim.device_lock import one_thread_at_a_time
-from qsim.rendering import mitsuba_xml
+from qsim.rendering import metallic_roughness, mitsuba_xml
 from qsim.rendering.engine import errors_only, opaque
-from qsim.rendering.mitsuba_mesh import NORMALS, POSITIONS, mesh_shape, vertex_normals, vertices_of
+from qsim.rendering.mitsuba_mesh import COLOURS, NORMALS, POSITIONS, mesh_shape, vertex_normals, vertices_of
 from qsim.scene import Body, Mesh, Part, Scene, lights, materials
 from qsim.scene.bands import Colour, largest, numbers
 from qsim.scene.environment import environment_map, sky_map, sun_direction, sun_radiance
@@ -30,6 +31,7 @@ LARGE = 20_000  # triangles from which a rigid body becomes an instance
 # rays find them anyway, and sampling them takes samples from the sun or the lamp. test_mitsuba_scene.py requires 1.25
 # times less error than with 1; docs/log.md has the measurement.
 SMOOTH_WEIGHT = 1 / 1024
+EDGE = 512  # texels across the picture of a spot's edge
 SUN_DISTANCE = 1000.0  # in units of the scene's reach from the camera: parallax of the sun under 1 mrad
 
 
@@ -128,9 +130,9 @@ class Stage:
     def _normals_of(self, name: str, body: Body, pose: Array, world: Array) -> Array:
         """Return unit normals of a smooth body, float32 [V, 3]; a rigid body's are computed once and rotated."""
         if body.deforms:
-            return vertex_normals(world, body.mesh.faces)
+            return vertex_normals(world, body.mesh.faces, body.mesh.groups)
         if name not in self._rest_normals:
-            self._rest_normals[name] = vertex_normals(body.mesh.vertices, body.mesh.faces)
+            self._rest_normals[name] = vertex_normals(body.mesh.vertices, body.mesh.faces, body.mesh.groups)
         return (self._rest_normals[name] @ pose[:3, :3].T).astype(np.float32)
 
     def _place_light(self, name: str, light: lights.Light, pose: Array) -> None:
@@ -140,6 +142,9 @@ class Stage:
         elif isinstance(light, lights.PointLight):
             position = _to_world(pose, np.array([light.position]))[0]
             self._set(f"{name}.position", position, lambda: self._opaque(self.mi.Point3f(position.tolist())))
+        elif isinstance(light, lights.SpotLight | lights.DirectionalLight):
+            placed = pose @ beam_pose(light)
+            self._set(f"{name}.to_world", placed, lambda: self._transform(placed))
 
     def _rest_of(self, part: Part) -> tuple[Array, ...]:
         """Return a file shape's rest state: its 4x4 placement, or its vertices [V, 3] and normals [V, 3] or [0, 3]."""
@@ -234,10 +239,24 @@ def lamp_pose(lamp: lights.AreaLamp) -> Array:
     return pose
 
 
+def beam_pose(light: lights.SpotLight | lights.DirectionalLight) -> Array:
+    """Return the matrix from a beam along +z to the light in the world, float64 [4, 4]."""
+    forward = np.asarray(light.direction, np.float64)
+    forward = forward / np.linalg.norm(forward)
+    helper = (0.0, 1.0, 0.0) if abs(forward[1]) < 0.99 else (1.0, 0.0, 0.0)
+    side = np.cross(helper, forward)
+    side /= np.linalg.norm(side)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([side, np.cross(forward, side), forward])
+    if isinstance(light, lights.SpotLight):
+        pose[:3, 3] = light.position
+    return pose
+
+
 def _is_instance(body: Body) -> bool:
     """Return whether a body is an instance of a mesh in body coordinates."""
     rigid = body.motion is not None and not body.deforms
-    return rigid and len(body.mesh.faces) >= LARGE and not isinstance(body.material, materials.Glow)
+    return rigid and len(body.mesh.faces) >= LARGE and not materials.emits(body.material)
 
 
 def _scene_dict(mi: Any, scene: Scene, smooth_weight: float) -> dict[str, Any]:
@@ -278,7 +297,26 @@ def _mesh(mi: Any, mesh: Mesh, name: str, vertices: Array, material: materials.M
         properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _value(mi, 0.0)})
     else:
         properties["bsdf"] = mi.load_dict(_bsdf(mi, material))
-    return mesh_shape(mi, mesh, name, vertices, properties, faces)
+    colours = None
+    if isinstance(material, materials.MetallicRoughness):
+        if material.glows:
+            emitter = {"type": "area", "radiance": _emission(mi, material.emission)}
+            properties["emitter"] = mi.load_dict(emitter)
+        if isinstance(material.reflectance, materials.VertexColours):
+            colours = _vertex_colours(mi, material.reflectance)
+    return mesh_shape(mi, mesh, name, vertices, properties, faces, colours)
+
+
+def _vertex_colours(mi: Any, given: materials.VertexColours) -> Array:
+    """Return the colours of vertices, [V, 3], or their luminance, [V, 1]."""
+    colours = given.colours.astype(np.float64)
+    return colours if mi.variant().endswith("_rgb") else luminance(colours)[:, None]
+
+
+def _emission(mi: Any, value: float | Colour | materials.Texture) -> Any:
+    if not isinstance(value, materials.Texture):
+        return _value(mi, value)
+    return _texture(mi, value, _pixels_of(mi, value))
 
 
 def _light(mi: Any, scene: Scene, light: lights.Light, name: str, smooth_weight: float) -> dict[str, Any]:
@@ -299,7 +337,30 @@ def _light(mi: Any, scene: Scene, light: lights.Light, name: str, smooth_weight:
             return {name: {"type": "rectangle", "to_world": place, "bsdf": black, "emitter": emitter}}
         case lights.PointLight(position, intensity):
             return {name: {"type": "point", "position": list(position), "intensity": _value(mi, intensity)}}
+        case lights.SpotLight():
+            return {name: _spot(mi, light)}
+        case lights.DirectionalLight(irradiance=irradiance):
+            place = mi.ScalarTransform4f(beam_pose(light).tolist())
+            return {name: {"type": "directional", "to_world": place, "irradiance": _value(mi, irradiance)}}
     raise ValueError(f"{light!r} is not one of the lights of qsim.scene")
+
+
+def _spot(mi: Any, light: lights.SpotLight) -> dict[str, Any]:
+    """Return Mitsuba's spot, whose own edge is hard, with a picture of the edge that glTF defines."""
+    along = (np.arange(EDGE) + 0.5) / EDGE * 2 - 1
+    across = np.hypot(*np.meshgrid(along, along)) * math.tan(light.outer)
+    least = math.cos(light.outer)
+    share = np.clip((np.cos(np.arctan(across)) - least) / (math.cos(light.inner) - least), 0, 1)
+    falling = share**2 * (3 - 2 * share) if light.smooth else share**2
+    edge = {"type": "bitmap", "data": mi.TensorXf(falling[..., None].astype(np.float32))}
+    return {
+        "type": "spot",
+        "to_world": mi.ScalarTransform4f(beam_pose(light).tolist()),
+        "intensity": _value(mi, light.intensity),
+        "cutoff_angle": math.degrees(light.outer),
+        "beam_width": math.degrees(light.outer) * (1 - 1e-4),
+        "texture": edge | {"raw": True, "wrap_mode": "clamp"},
+    }
 
 
 def _sun(mi: Any, scene: Scene, light: lights.SunSky) -> dict[str, Any]:
@@ -332,25 +393,86 @@ def _bsdf(mi: Any, material: materials.Material) -> dict[str, Any]:
             kind = "thindielectric" if thin else "roughdielectric" if roughness > 0 else "dielectric"
             rough = {"alpha": roughness, "distribution": "ggx"} if kind == "roughdielectric" else {}
             return {"type": kind, "int_ior": ior} | rough
+        case materials.MetallicRoughness():
+            return _metallic_roughness(mi, material)
         case _:
             raise ValueError(f"{material!r} is not one of the materials of qsim.scene")
+    return {"type": "twosided", "inner": _tilted(mi, inner, relief)}
+
+
+def _tilted(mi: Any, inner: dict[str, Any], relief: materials.Relief) -> dict[str, Any]:
+    """Return a surface whose normals follow a relief."""
     match relief:
         case materials.Bump(texture, height):
-            inner = {
+            return {
                 "type": "bumpmap",
                 "relief": _texture(mi, texture, texture.pixels()[..., None]),
                 "scale": height,
                 "inner": inner,
             }
-        case materials.NormalMap(image, repeat):
-            picture = _bitmap(mi, np.asarray(image, np.float32), repeat)
-            inner = {"type": "normalmap", "normalmap": picture, "inner": inner}
-    return {"type": "twosided", "inner": inner}
+        case materials.NormalMap(image, repeat, wrap):
+            picture = _bitmap(mi, np.asarray(image, np.float32), repeat, wrap=wrap)
+            return {"type": "normalmap", "normalmap": picture, "inner": inner}
+    return inner
 
 
-def _reflectance(mi: Any, value: float | Colour | materials.Texture) -> Any:
+def _metallic_roughness(mi: Any, material: materials.MetallicRoughness) -> dict[str, Any]:
+    glass = isinstance(material.transmission, materials.Texture) or material.transmission > 0
+    base = _reflectance(mi, material.reflectance)
+    # The scalar engine would call a plugin in Python for every ray.
+    if glass or mi.variant().startswith("scalar"):
+        inner: dict[str, Any] = {
+            "type": "principled",
+            "base_color": base,
+            "metallic": _share(mi, material.metallic),
+            "roughness": _share(mi, material.roughness),
+            "eta": material.ior,
+        }
+        inner |= {"spec_trans": _share(mi, material.transmission)} if glass else {}
+        surface = _tilted(mi, inner, material.relief)
+        surface = surface if glass else {"type": "twosided", "inner": surface}
+    else:
+        metallic_roughness.register(mi)
+        inner = {
+            "type": metallic_roughness.NAME,
+            "base_color": _as_texture(mi, base),
+            "metallic": _as_texture(mi, _share(mi, material.metallic)),
+            "roughness": _as_texture(mi, _share(mi, material.roughness)),
+            "reflection": ((material.ior - 1) / (material.ior + 1)) ** 2,
+            "clearcoat": material.clearcoat,
+            "clearcoat_alpha": material.clearcoat_roughness**2,
+        }
+        surface = {"type": "twosided", "inner": _tilted(mi, inner, material.relief)}
+    if isinstance(material.opacity, materials.Texture) or material.opacity < 1:
+        surface = {"type": "mask", "opacity": _share(mi, material.opacity), "nested": surface}
+    return surface
+
+
+def _as_texture(mi: Any, value: Any) -> Any:
+    """Return a loaded texture: a plugin in Python gets numbers and colours as they are, and not as textures."""
+    return mi.load_dict(value if isinstance(value, dict) else {"type": "uniform", "value": value})
+
+
+def _share(mi: Any, value: float | materials.Texture) -> Any:
+    """Return a number from 0 to 1, or a texture of such numbers, which has one channel in all variants."""
+    if not isinstance(value, materials.Texture):
+        return float(value)
+    pixels = value.pixels()[..., None]
+    if pixels.min() < 0 or pixels.max() > 1:
+        raise ValueError(f"Texture of shares: 0..1 expected, found {pixels.min()}..{pixels.max()}")
+    return _texture(mi, value, pixels)
+
+
+def _pixels_of(mi: Any, texture: materials.Texture) -> Array:
+    """Return the values of a texture in the bands of the variant, [H, W, 3] or [H, W, 1]."""
+    return texture.colours() if mi.variant().endswith("_ad_rgb") else texture.pixels()[..., None]
+
+
+def _reflectance(mi: Any, value: float | Colour | materials.Texture | materials.VertexColours) -> Any:
+    if isinstance(value, materials.VertexColours):
+        return {"type": "mesh_attribute", "name": COLOURS}
     if isinstance(value, materials.Texture):
-        pixels = value.colours() if mi.variant().endswith("_ad_rgb") else value.pixels()[..., None]
+        pixels = _pixels_of(mi, value)
         if pixels.min() < 0 or pixels.max() > 1:
             raise ValueError(f"Texture of a reflectance: 0..1 expected, found {pixels.min()}..{pixels.max()}")
         return _texture(mi, value, pixels)

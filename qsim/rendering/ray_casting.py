@@ -1,4 +1,7 @@
-"""Casts rays into a loaded scene: distance, body and triangle of the first hit along each."""
+"""Casts rays into a loaded scene: distance, body and triangle of the first hit along each.
+
+A ray passes through a surface where that lets more than half of the light straight on: through holes.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,11 @@ from numpy import ndarray as Array
 
 from qsim.optics.camera import Camera
 from qsim.rendering.mitsuba_scene import Stage
+from qsim.scene import Body
+from qsim.scene.materials import MetallicRoughness, Texture, see_through
+
+MOST_LAYERS = 32  # of surfaces with holes, one behind the other
+GAP = 1e-5  # relative distance behind a hole at which a ray goes on
 
 
 @dataclass(frozen=True)
@@ -41,6 +49,33 @@ class RayCaster:
         """Return the first hits along rays [3, N] in the axes of a camera with this pose [4, 4]."""
         origin = pose[:3, 3]
         directions = pose[:3, :3] @ rays
+        hits = self._first(origin, directions)
+        if not self._stage.scene.see_through:
+            return hits
+        for _ in range(MOST_LAYERS):
+            chosen = np.flatnonzero(self._passes(hits))
+            if not len(chosen):
+                break
+            start = hits.distance[chosen] * (1 + GAP)
+            moved = origin[:, None] + directions[:, chosen] * start
+            behind = self._first(moved, directions[:, chosen])
+            hits.distance[chosen] = behind.distance + start
+            hits.number[chosen] = behind.number
+            hits.triangle[chosen] = behind.triangle
+            hits.weights[chosen] = behind.weights
+        return hits
+
+    def _passes(self, hits: Hits) -> Array:
+        """Return which hits [N] are of a hole."""
+        found = np.zeros(len(hits.number), bool)
+        for i, body in enumerate(self._stage.scene.bodies):
+            if see_through(body.material):
+                chosen = np.flatnonzero(hits.number == i)
+                found[chosen] = _opacity(body, hits, chosen) < 0.5
+        return found
+
+    def _first(self, origin: Array, directions: Array) -> Hits:
+        """Return the first hits from one point [3], or from points [3, N], along directions [3, N]."""
         if self._scalar:
             return self._cast_one_by_one(origin, directions)
         import drjit as dr
@@ -48,7 +83,10 @@ class RayCaster:
         mi = self._mi
         direction = mi.Vector3f(directions.astype(np.float32))
         length = dr.norm(direction)
-        eye = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in origin))
+        if origin.ndim == 1:
+            eye = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in origin))
+        else:
+            eye = mi.Point3f(origin.astype(np.float32))
         ray = mi.Ray3f(eye, direction / length)
         found = self._stage.loaded.ray_intersect_preliminary(ray, coherent=True)
         hit = found.is_valid()
@@ -87,8 +125,9 @@ class RayCaster:
         number = np.full(len(lengths), -1, np.int32)
         triangle = np.zeros(len(lengths), np.int64)
         weights = np.zeros((len(lengths), 2))
+        origins = np.broadcast_to(origin if origin.ndim > 1 else origin[:, None], directions.shape)
         for i, (direction, length) in enumerate(zip(directions.T, lengths, strict=True)):
-            ray = mi.Ray3f(origin.tolist(), (direction / length).tolist())
+            ray = mi.Ray3f(origins[:, i].tolist(), (direction / length).tolist())
             found = self._stage.loaded.ray_intersect_preliminary(ray)
             if found.is_valid():
                 name = (found.instance or found.shape).id()
@@ -121,3 +160,16 @@ def _index(mi: Any, found: Any) -> Any:
     instance: Any = dr.reinterpret_array(mi.UInt32, found.instance)
     # Dr.Jit leaves misses uninitialised.
     return dr.select(found.is_valid(), dr.select(instance > 0, instance, shape), 0)
+
+
+def _opacity(body: Body, hits: Hits, chosen: Array) -> Array:
+    """Return the opacity [n] of a body at these of the hits."""
+    assert isinstance(body.material, MetallicRoughness)
+    opacity = body.material.opacity
+    if not isinstance(opacity, Texture):
+        return np.full(len(chosen), opacity)
+    assert body.mesh.uv is not None
+    corners = body.mesh.uv[body.mesh.faces[hits.triangle[chosen]]]
+    weights = hits.weights[chosen]
+    first = 1 - weights.sum(axis=1)
+    return opacity.at(np.einsum("nij,ni->nj", corners, np.column_stack([first, weights])))

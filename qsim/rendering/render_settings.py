@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from qsim import limits, records
-from qsim.kinds import FrameRate, Frames, Psnr, Shutter, Text
+from qsim.kinds import FrameRate, Frames, Number, Psnr, Shutter, Text
 from qsim.settings import setting
 
 SIDE = 128  # px, height and width of a scene that states none
@@ -37,6 +37,14 @@ class RenderSettings:
             shown="FILE",
             example="path.json",
         ),
+    ] = None
+    camera: Annotated[
+        Text | None,
+        setting("camera of a glTF file, by name", unset="chosen by the seed", example="Camera"),
+    ] = None
+    start: Annotated[
+        Number | None,
+        setting("time of a glTF file's animations at the first frame", unit="s", unset="0", example=0.5),
     ] = None
     reuse: Annotated[
         bool | None,

@@ -403,7 +403,9 @@ class Renderer:
     def _integrator(self, bounces: int) -> Any:
         """Return a path tracer without Russian roulette: equal seeds give equal paths at every depth."""
         if bounces not in self._integrators:
-            plugin = {"type": "path", "max_depth": bounces + 1, "rr_depth": 1000}
+            # Only the second one lets light through holes on its way from a lamp; it takes a little longer.
+            kind = "volpath" if self.scene.see_through else "path"
+            plugin = {"type": kind, "max_depth": bounces + 1, "rr_depth": 1000}
             self._integrators[bounces] = self.mi.load_dict(plugin)
         return self._integrators[bounces]
 

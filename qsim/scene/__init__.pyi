@@ -1,4 +1,5 @@
 from .animated.gltf_body import animated_file as animated_file
+from .animated.gltf_scene import read_gltf as read_gltf
 from .animated.skinning import Joint as Joint
 from .animated.skinning import Morph as Morph
 from .animated.skinning import Skinned as Skinned
@@ -12,9 +13,11 @@ from .flicker import PulseWidth as PulseWidth
 from .flicker import RectifiedSine as RectifiedSine
 from .lights import AreaLamp as AreaLamp
 from .lights import Constant as Constant
+from .lights import DirectionalLight as DirectionalLight
 from .lights import EnvironmentImage as EnvironmentImage
 from .lights import Light as Light
 from .lights import PointLight as PointLight
+from .lights import SpotLight as SpotLight
 from .lights import SunSky as SunSky
 from .materials import Bump as Bump
 from .materials import Conductor as Conductor
@@ -22,12 +25,14 @@ from .materials import Dielectric as Dielectric
 from .materials import Diffuse as Diffuse
 from .materials import Glow as Glow
 from .materials import Material as Material
+from .materials import MetallicRoughness as MetallicRoughness
 from .materials import NormalMap as NormalMap
 from .materials import Patches as Patches
 from .materials import Picture as Picture
 from .materials import Relief as Relief
 from .materials import RoughPlastic as RoughPlastic
 from .materials import Texture as Texture
+from .materials import VertexColours as VertexColours
 from .motion import Ballistic as Ballistic
 from .motion import Composition as Composition
 from .motion import Keyframes as Keyframes

@@ -12,7 +12,9 @@ from qsim.optics.radiometry import RGB
 Colour = tuple[float, float, float]  # values of the bands R, G and B
 Bands = tuple[float, float, float]  # m, wavelengths of R, G and B
 
-PER_BAND = frozenset({"reflectance", "radiance", "intensity", "eta", "k", "sun_irradiance", "sky_irradiance"})
+PER_BAND = frozenset(
+    {"reflectance", "radiance", "emission", "intensity", "irradiance", "eta", "k", "sun_irradiance", "sky_irradiance"}
+)
 
 
 def numbers(value: Any) -> Iterator[float]:

@@ -43,7 +43,12 @@ def file_beside(document: Path, where: str, name: str, folder: Path | None = Non
 
 def picture_of(document: Path, where: str, name: str, folder: Path | None = None) -> tuple[Picture, str]:
     """Return an image file that a document names, and its SHA-256; errors as of `file_beside` and `picture_in`."""
-    return picture_in(regular_bytes(file_beside(document, where, name, folder), where), f"{where}: {name:.60}")
+    return picture_in(bytes_beside(document, where, name, folder), f"{where}: {name:.60}")
+
+
+def bytes_beside(document: Path, where: str, name: str, folder: Path | None = None) -> bytes:
+    """Return the bytes of a file that a document names; errors as of `file_beside` and `regular_bytes`."""
+    return regular_bytes(file_beside(document, where, name, folder), where)
 
 
 def picture_in(raw: bytes, where: str) -> tuple[Picture, str]:

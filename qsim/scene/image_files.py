@@ -39,6 +39,23 @@ def _asset(path: Path, role: str) -> BinaryIO:
         raise type(error)(f"{role} {error}") from None
 
 
+def stored(source: BinaryIO, where: str) -> np.ndarray:
+    """Return the stored numbers of an image file in 0..1, float32 [H, W, 4], with an opacity of 1 where it has none.
+
+    Rows are as they are stored. `ValueError` starts with `where`.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(source) as opened:
+            if opened.mode.startswith("I"):
+                grey = np.asarray(opened).astype(np.float32)[..., None] / np.float32(65535)
+                return np.clip(np.concatenate([grey, grey, grey, np.ones_like(grey)], axis=-1), 0, 1)
+            return np.asarray(opened.convert("RGBA"), np.float32) / np.float32(255)
+    except (OSError, Image.DecompressionBombError) as error:
+        raise ValueError(f"{where}: not a readable image ({error})") from error
+
+
 def decoded(source: BinaryIO, where: str, *, turned: bool = True) -> np.ndarray:
     """Return linear colours, float32 [H, W, 3], of an open image file; `ValueError` starts with `where`.
 

@@ -13,6 +13,8 @@ from qsim.scene.bands import Colour, largest, numbers
 from qsim.scene.flicker import Flicker, check_flicker
 from qsim.scene.motion import check_numbers
 
+WIDEST = 1.5  # rad, the outer angle of a spot; its picture of the edge needs an end before pi / 2
+
 
 @dataclass(frozen=True, eq=False)
 class Constant:
@@ -85,6 +87,49 @@ class PointLight:
 
 
 @dataclass(frozen=True, eq=False)
+class SpotLight:
+    """A point light in a cone: inside the inner angle irradiance is intensity / r^2, outside the outer one nothing.
+
+    Between them it falls with the cosine's share s as s^2, which glTF's KHR_lights_punctual proposes, or where `smooth`
+    as s^2 (3 - 2 s), which Blender computes.
+    """
+
+    position: Vector  # m
+    direction: Vector
+    intensity: float | Colour  # W sr^-1
+    outer: float = math.pi / 4  # rad, from the axis to the edge; at most 1.5
+    inner: float = 0.0  # rad, below the outer angle
+    smooth: bool = False
+    motion: Pose | None = None  # in world axes
+    flicker: Flicker | None = None  # None: steady
+
+    def __post_init__(self) -> None:
+        check_light(self, "intensity")
+        check_flicker(self)
+        _check_direction(self)
+        if not 0 <= self.inner < self.outer <= WIDEST:
+            raise ValueError(
+                f"SpotLight: angles [rad] 0 <= inner < outer <= {WIDEST:g} are needed, got {self.inner!r} and "
+                f"{self.outer!r}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class DirectionalLight:
+    """Parallel light from infinitely far away."""
+
+    direction: Vector  # in which it travels
+    irradiance: float | Colour  # W m^-2 on a plane across it
+    motion: Pose | None = None  # in world axes; its rotation turns the direction
+    flicker: Flicker | None = None  # None: steady
+
+    def __post_init__(self) -> None:
+        check_light(self, "irradiance")
+        check_flicker(self)
+        _check_direction(self)
+
+
+@dataclass(frozen=True, eq=False)
 class EnvironmentImage:
     """An equirectangular picture of radiance around the scene, zenith on top: array [H, W] or [H, W, 3], or .hdr, .exr.
 
@@ -103,7 +148,7 @@ class EnvironmentImage:
         check_flicker(self)
 
 
-Light = Constant | SunSky | AreaLamp | PointLight | EnvironmentImage
+Light = Constant | SunSky | AreaLamp | PointLight | SpotLight | DirectionalLight | EnvironmentImage
 ENVIRONMENTS = (Constant, SunSky, EnvironmentImage)
 
 
@@ -114,8 +159,10 @@ def strength(light: Light) -> float:
             return largest(radiance)
         case SunSky(sun_irradiance=sun, sky_irradiance=sky):
             return largest(sun) + largest(sky)
-        case PointLight(intensity=intensity):
+        case PointLight(intensity=intensity) | SpotLight(intensity=intensity):
             return largest(intensity)
+        case DirectionalLight(irradiance=irradiance):
+            return largest(irradiance)
         case EnvironmentImage(image, scale):
             return scale * (1.0 if isinstance(image, str) else float(np.max(image)))
     raise ValueError(f"{light!r} is not one of the lights of qsim.scene")
@@ -128,3 +175,9 @@ def check_light(light: Any, *names: str) -> None:
         found = getattr(light, name)
         if min(numbers(found), default=-1) < 0:
             raise ValueError(f"{type(light).__name__}.{name}: a finite number from 0 up is expected, got {found!r}")
+
+
+def _check_direction(light: Any) -> None:
+    """Raise `ValueError` for a direction of no length."""
+    if not np.linalg.norm(light.direction) > 0:
+        raise ValueError(f"{type(light).__name__}.direction: a vector other than zero is needed")

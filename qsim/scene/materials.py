@@ -50,6 +50,19 @@ class Texture:
         if self.wrap not in WRAPS:
             raise ValueError(f"Texture.wrap: one of {', '.join(WRAPS)} is expected, got {self.wrap!r}")
 
+    def at(self, uv: np.ndarray) -> np.ndarray:
+        """Return the linear values of the texels at coordinates [N, 2], float32 [N]; errors as of `pixels`."""
+        pixels = self.pixels()
+        places = uv * self.repeat
+        if self.wrap == "repeat":
+            places = places % 1.0
+        elif self.wrap == "mirror":
+            places = 1 - np.abs(places % 2.0 - 1)
+        height, width = pixels.shape
+        column = np.clip((places[:, 0] * width).astype(np.int64), 0, width - 1)
+        row = np.clip(((1 - places[:, 1]) * height).astype(np.int64), 0, height - 1)
+        return np.asarray(pixels[row, column])
+
     def pixels(self) -> np.ndarray:
         """Return linear values, float32 [H, W]; `FileNotFoundError` or `ValueError` with the file's name."""
         if isinstance(self.image, Picture):
@@ -97,8 +110,11 @@ class NormalMap:
 
     image: np.ndarray
     repeat: tuple[float, float] = (1.0, 1.0)
+    wrap: str = field(default="repeat", metadata={"described": "if any"})  # beyond 0..1: one of WRAPS
 
     def __post_init__(self) -> None:
+        if self.wrap not in WRAPS:
+            raise ValueError(f"NormalMap.wrap: one of {', '.join(WRAPS)} is expected, got {self.wrap!r}")
         image = np.asarray(self.image)
         if image.ndim != 3 or image.shape[2] != 3 or not image.size:
             raise ValueError(f"NormalMap.image: a picture [H, W, 3] is expected, got shape {image.shape}")
@@ -173,6 +189,57 @@ class Dielectric:
 
 
 @dataclass(frozen=True, eq=False)
+class VertexColours:
+    """Linear colours of the vertices of a mesh, interpolated between them; their luminance in scenes of one band."""
+
+    colours: np.ndarray  # float [V, 3], 0..1
+
+    def __post_init__(self) -> None:
+        if self.colours.ndim != 2 or self.colours.shape[1] != 3 or not len(self.colours):
+            raise ValueError(f"VertexColours.colours: [V, 3] is expected, got shape {self.colours.shape}")
+        if not (self.colours.min() >= 0 and self.colours.max() <= 1):
+            raise ValueError("VertexColours.colours: values from 0 to 1 are expected")
+
+
+@dataclass(frozen=True, eq=False)
+class MetallicRoughness:
+    """The surface of glTF 2.0: a diffuse base under a rough dielectric coat, mixed with a metal.
+
+    Where `transmission` is above 0 it is Disney's surface as Mitsuba computes it (Burley, 2015), whose base is up to a
+    tenth brighter than a diffuse one. Both sides look alike, but glass has an inside. A surface may also emit, on its
+    outer side, and let a share of the light pass straight on.
+    """
+
+    reflectance: float | Colour | Texture | VertexColours = 0.5  # base colour, 0..1
+    metallic: float | Texture = 0.0  # 0..1
+    roughness: float | Texture = 0.5  # 0..1; the GGX alpha is its square
+    ior: float = 1.5  # above 1
+    transmission: float | Texture = 0.0  # share of glass, 0..1
+    clearcoat: float = 0.0  # strength of a second coat of index 1.5, 0..1; glass has none
+    clearcoat_roughness: float = 0.0  # 0..1
+    emission: float | Colour | Texture = 0.0  # W m^-2 sr^-1
+    opacity: float | Texture = 1.0  # 0..1
+    relief: Relief = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.reflectance, VertexColours):
+            _check_reflectance(self)
+        for name in ("metallic", "roughness", "transmission", "clearcoat", "clearcoat_roughness", "opacity"):
+            found = getattr(self, name)
+            if not isinstance(found, Texture) and not (_is_number(found) and 0 <= found <= 1):
+                raise ValueError(f"MetallicRoughness.{name}: a number from 0 to 1 is expected, got {found!r}")
+        if not (_is_number(self.ior) and self.ior > 1):
+            raise ValueError(f"MetallicRoughness.ior: a finite number above 1 is expected, got {self.ior!r}")
+        if not isinstance(self.emission, Texture):
+            check_light(self, "emission")
+
+    @property
+    def glows(self) -> bool:
+        """Whether the surface emits."""
+        return isinstance(self.emission, Texture) or max(numbers(self.emission)) > 0
+
+
+@dataclass(frozen=True, eq=False)
 class Glow:
     """A surface whose outer side emits the same radiance in all directions; it reflects nothing."""
 
@@ -202,10 +269,24 @@ class Patches:
                 raise ValueError(f"Patches: a {type(material).__name__} has no parts; give such a body its own mesh")
 
 
-Material = Diffuse | RoughPlastic | Conductor | Dielectric | Glow | Patches
+Material = Diffuse | RoughPlastic | Conductor | Dielectric | MetallicRoughness | Glow | Patches
 
 
-def _check_reflectance(material: Diffuse | RoughPlastic) -> None:
+def see_through(material: Material) -> bool:
+    """Return whether a surface lets light pass straight on, as one with holes."""
+    if not isinstance(material, MetallicRoughness):
+        return False
+    return isinstance(material.opacity, Texture) or material.opacity < 1
+
+
+def emits(material: Material) -> bool:
+    """Return whether a surface glows."""
+    if isinstance(material, Glow):
+        return max(numbers(material.radiance)) > 0
+    return isinstance(material, MetallicRoughness) and material.glows
+
+
+def _check_reflectance(material: Diffuse | RoughPlastic | MetallicRoughness) -> None:
     found = material.reflectance
     kind = type(material).__name__
     values = list(numbers(found))
@@ -217,7 +298,9 @@ def shows_picture(material: Material) -> bool:
     """Return whether a material places a picture on its surface: a texture or a relief."""
     if isinstance(material, Patches):
         return any(shows_picture(part) for part in material.materials)
-    return isinstance(getattr(material, "reflectance", None), Texture) or getattr(material, "relief", None) is not None
+    if getattr(material, "relief", None) is not None:
+        return True
+    return any(isinstance(value, Texture) for value in vars(material).values())
 
 
 def _check_surface(material: Any) -> None:

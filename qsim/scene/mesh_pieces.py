@@ -72,7 +72,7 @@ def material_of(pieces: Sequence[Piece]) -> Diffuse | Patches | None:
     for _, group in itertools.groupby(pieces, lambda piece: id(piece.paint)):
         alike = list(group)
         paint = alike[0].paint or _WHITE
-        texture = _texture(paint, [piece.uv for piece in alike if piece.uv is not None])
+        texture = texture_of(paint, [piece.uv for piece in alike if piece.uv is not None])
         assert isinstance(texture.image, Picture)
         shown[id(texture.image.colours)] = texture.image.colours.size // 3
         if sum(shown.values()) > limits.TEXELS:
@@ -92,7 +92,7 @@ def by_paint(pieces: Sequence[Painted]) -> list[Painted]:
     return sorted(pieces, key=lambda piece: first[id(piece.paint)])
 
 
-def _texture(paint: Paint, coordinates: Sequence[Array]) -> Texture:
+def texture_of(paint: Paint, coordinates: Sequence[Array]) -> Texture:
     """Return the texture of a paint, which is shown at these coordinates [V, 2] of some pieces."""
     factor = np.array(paint.factor, np.float32)
     if paint.image is None:

@@ -23,10 +23,19 @@ import numpy as np
 from qsim.checks import require_finite
 from qsim.host import own_numbers
 from qsim.optics.camera import Camera, Pose
-from qsim.scene.bands import Bands, check_bands, has_colour, largest
+from qsim.scene.bands import Bands, check_bands, has_colour
 from qsim.scene.flicker import Flicker
 from qsim.scene.lights import ENVIRONMENTS, Light, strength
-from qsim.scene.materials import Diffuse, Glow, Material, Patches, shows_picture
+from qsim.scene.materials import (
+    Diffuse,
+    Material,
+    MetallicRoughness,
+    Patches,
+    VertexColours,
+    emits,
+    see_through,
+    shows_picture,
+)
 
 
 @runtime_checkable
@@ -45,6 +54,8 @@ class Mesh:
     faces: np.ndarray  # int [F, 3], indices into vertices, counter-clockwise seen from outside
     uv: np.ndarray | None = None  # float64 [V, 2]; row 0 of a texture lies at v = 1, its column 0 at u = 0
     smooth: bool = False  # shade with interpolated vertex normals
+    # int [V]; vertices of one number share a normal, as the two sides of a seam. None: each has its own
+    groups: np.ndarray | None = dataclasses.field(default=None, metadata={"described": "if any"})
 
     def __post_init__(self) -> None:
         vertices = np.asarray(self.vertices, np.float64)
@@ -64,6 +75,11 @@ class Mesh:
                 raise ValueError(f"Mesh.uv: expected [{len(vertices)}, 2], got {uv.shape}")
             require_finite("Mesh.uv", uv)
             object.__setattr__(self, "uv", uv)
+        if self.groups is not None:
+            groups = np.asarray(self.groups, np.int64)
+            if groups.shape != (len(vertices),) or groups.min() < 0 or groups.max() >= len(vertices):
+                raise ValueError(f"Mesh.groups: a number below {len(vertices)} per vertex is expected")
+            object.__setattr__(self, "groups", groups)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +96,12 @@ class Body:
             raise ValueError(
                 f"body {self.name}: its material shows a picture, and its mesh has no texture coordinates; give Mesh "
                 "uv=, or build it with qsim.scene.shapes.box_mapped"
+            )
+        colours = self.material.reflectance if isinstance(self.material, MetallicRoughness) else None
+        if isinstance(colours, VertexColours) and len(colours.colours) != len(self.mesh.vertices):
+            raise ValueError(
+                f"body {self.name}: its material colours {len(colours.colours)} vertices, its mesh has "
+                f"{len(self.mesh.vertices)}"
             )
         if isinstance(self.material, Patches) and sum(self.material.counts) != len(self.mesh.faces):
             raise ValueError(
@@ -185,9 +207,12 @@ class Scene:
         """Return whether anything emits light."""
         if self.file is not None:
             return True  # checked when the file was read
-        return any(strength(light) > 0 for light in self.lights) or any(
-            isinstance(body.material, Glow) and largest(body.material.radiance) > 0 for body in self.bodies
-        )
+        return any(strength(light) > 0 for light in self.lights) or any(emits(body.material) for body in self.bodies)
+
+    @functools.cached_property
+    def see_through(self) -> bool:
+        """Whether a body lets light pass straight on."""
+        return any(see_through(body.material) for body in self.bodies)
 
     @functools.cached_property
     def flickers(self) -> dict[str, Flicker]:
@@ -241,7 +266,9 @@ def describe(value: Any) -> Any:
 
 def _is_told(record: Any, field: dataclasses.Field[Any]) -> bool:
     """Return whether a description holds a field: not where it is marked "if any" and has its default."""
-    return "described" not in field.metadata or getattr(record, field.name) != field.default
+    value = getattr(record, field.name)
+    default = value is field.default or (not isinstance(value, np.ndarray) and value == field.default)
+    return "described" not in field.metadata or not default
 
 
 def _check_motion(scene: str, body: Body | Part) -> None:

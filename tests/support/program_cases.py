@@ -76,8 +76,9 @@ def slow_calls(shared: Path) -> dict[str, Call]:
 
     def planned(_: Path) -> Any:
         from qsim.dataset.scene_rendering import load_scene
+        from qsim.rendering.render_settings import RenderSettings
 
-        scene, _read = load_scene("plain", 12, 16, 0, None)
+        scene, _read = load_scene("plain", 0, None, RenderSettings(height=12, width=16))
         chosen = qsim.choose_budget(scene, frames=2, psnr=25, denoise=False)
         return [chosen.samples, chosen.bounces, chosen.left_out]
 

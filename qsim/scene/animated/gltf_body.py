@@ -19,7 +19,7 @@ from msgspec import Meta
 from qsim import limits
 from qsim.kinds import Count, Number
 from qsim.records import convert
-from qsim.scene.animated.gltf_buffers import Document, entries_of, open_document
+from qsim.scene.animated.gltf_buffers import Accessor, Document, entries_of, open_document
 from qsim.scene.animated.gltf_materials import Paints
 from qsim.scene.animated.gltf_nodes import (
     Indices,
@@ -77,8 +77,8 @@ class SceneChoice(TypedDict):
 
 
 @dataclass(frozen=True, eq=False)
-class _Piece:
-    """One primitive: vertices in the coordinates of its joints."""
+class FilePiece:
+    """One primitive of a node: vertices in the coordinates of its joints."""
 
     vertices: np.ndarray  # [V, 3]
     faces: np.ndarray  # [F, 3]
@@ -89,6 +89,9 @@ class _Piece:
     displacements: np.ndarray  # [M, V, 3]
     weights: Track | None  # [K, M]
     paint: Paint | None
+    material: int | None = None  # of the file
+    normals: np.ndarray | None = None  # [V, 3]
+    colours: np.ndarray | None = None  # [V, 3], linear
 
 
 def animations_in(path: str | Path) -> list[str]:
@@ -115,7 +118,7 @@ def animated_file(
     """
     document = open_document(Path(path))
     nodes = nodes_of(document)
-    targets = {i: n for i, node in enumerate(nodes) if (n := _target_count(document, node))}
+    targets = {i: n for i, node in enumerate(nodes) if (n := target_count(document, node))}
     tracks = tracks_of(document, chosen_animation(document, animation), nodes, targets)
     pieces, joints = _read(document, nodes, tracks)
     clock = Clock(speed, start, max(float(track.times[-1]) for track in tracks.values()), repeat)
@@ -129,15 +132,15 @@ def still_pieces(path: str | Path) -> list[Piece]:
     """
     document = open_document(Path(path))
     pieces, joints = _read(document, nodes_of(document), {})
-    raw = _unscaled(pieces, joints)
-    _check_reach(document, raw)
+    raw = unscaled(pieces, joints)
+    check_reach(document, raw)
     vertices = raw.deform(0.0)
     mirrored = np.linalg.det(raw.matrices(0.0)[:, :3, :3]) < 0
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
     return [
         Piece(
             vertices[start : start + len(piece.vertices)],
-            _outward(piece, mirrored),
+            outward(piece, mirrored),
             None if np.isnan(piece.uv).any() else piece.uv,
             piece.paint,
         )
@@ -147,16 +150,16 @@ def still_pieces(path: str | Path) -> list[Piece]:
 
 def _read(
     document: Document, nodes: list[Node], tracks: dict[tuple[int, str], Track]
-) -> tuple[list[_Piece], list[Joint]]:
+) -> tuple[list[FilePiece], list[Joint]]:
     """Return all primitives of the file's scene, and the joints that they follow."""
     order, parents = parents_first(document, nodes)
     joints, number = joints_of(document, nodes, tracks, order, parents)
     paints = Paints(document)
-    pieces: list[_Piece] = []
-    for i in _shown(document, nodes, order, parents):
+    pieces: list[FilePiece] = []
+    for i in shown_nodes(document, nodes, order, parents):
         if "mesh" not in nodes[i]:
             continue
-        for piece in _pieces(document, i, nodes, tracks, joints, number, paints):
+        for piece in pieces_of_node(document, i, nodes, tracks, joints, number, paints):
             pieces.append(piece)
             if sum(len(each.vertices) for each in pieces) > limits.VERTICES:  # a small file can name one array often
                 raise ValueError(f"{document.path}: its meshes have more than {limits.VERTICES} vertices in all")
@@ -165,7 +168,7 @@ def _read(
     return by_paint(pieces), joints
 
 
-def _shown(document: Document, nodes: list[Node], order: list[int], parents: Mapping[int, int]) -> Iterator[int]:
+def shown_nodes(document: Document, nodes: list[Node], order: list[int], parents: Mapping[int, int]) -> Iterator[int]:
     """Yield the nodes of the file's scene; without scenes, all nodes."""
     scenes = entries_of(document.path, document.content, "scenes")
     if not scenes:
@@ -179,7 +182,7 @@ def _shown(document: Document, nodes: list[Node], order: list[int], parents: Map
             yield i
 
 
-def _target_count(document: Document, node: Node) -> int:
+def target_count(document: Document, node: Node) -> int:
     """Return how many morph targets the mesh of a node has."""
     if "mesh" not in node:
         return 0
@@ -194,7 +197,7 @@ def _target_count(document: Document, node: Node) -> int:
     return counts.pop()
 
 
-def _pieces(
+def pieces_of_node(
     document: Document,
     number: int,
     nodes: list[Node],
@@ -202,7 +205,7 @@ def _pieces(
     joints: list[Joint],
     joint_of: Mapping[int, int],
     paints: Paints,
-) -> Iterator[_Piece]:
+) -> Iterator[FilePiece]:
     """Yield the primitives of a node; joints that a skin adds are appended to `joints`."""
     node = nodes[number]
     mesh = document.entry("meshes", node["mesh"], MeshEntry, f"nodes[{number}]")
@@ -240,7 +243,29 @@ def _pieces(
         weights = _weights(document, number, node, mesh, tracks, len(displacements)) if len(displacements) else None
         faces = _faces(document, primitive, where, count)
         paint = paints.paint(primitive.get("material"), where)
-        yield _Piece(vertices, faces, uv, "NORMAL" in attributes, owners, shares, displacements, weights, paint)
+        yield FilePiece(
+            vertices,
+            faces,
+            uv,
+            "NORMAL" in attributes,
+            owners,
+            shares,
+            displacements,
+            weights,
+            paint,
+            primitive.get("material"),
+            document.array(attributes["NORMAL"], where, "VEC3", count) if "NORMAL" in attributes else None,
+            _colours(document, attributes, where, count),
+        )
+
+
+def _colours(document: Document, attributes: Mapping[str, int], where: str, count: int) -> np.ndarray | None:
+    """Return the linear colours [V, 3] of vertices, without their opacity; None if the file has none."""
+    if "COLOR_0" not in attributes:
+        return None
+    about = document.entry("accessors", attributes["COLOR_0"], Accessor, where)
+    found = document.array(attributes["COLOR_0"], where, "VEC4" if about["type"] == "VEC4" else "VEC3", count)
+    return np.clip(found[:, :3].astype(np.float64), 0, 1)
 
 
 def _bones(document: Document, skin: int, by: str, joints: list[Joint], joint_of: Mapping[int, int]) -> np.ndarray:
@@ -314,15 +339,15 @@ def _faces(document: Document, primitive: Mapping[str, Any], where: str, count: 
 
 
 def _joined(
-    document: Document, pieces: list[_Piece], joints: list[Joint], clock: Clock, size: float | None, carrier: Motion
+    document: Document, pieces: list[FilePiece], joints: list[Joint], clock: Clock, size: float | None, carrier: Motion
 ) -> tuple[Mesh, Skinned]:
     """Return all pieces as one mesh and one motion, centred and scaled."""
     if size is not None and not 0 < size < np.inf:
         raise ValueError(f"animated_file: size must be a length above 0 [m], got {size!r}")
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
-    raw = _unscaled(pieces, joints)
+    raw = unscaled(pieces, joints)
     moment = clock.at(0.0)
-    reach = _check_reach(document, raw)
+    reach = check_reach(document, raw)
     first = raw.deform(moment)
     low = first.min(0)
     high = first.max(0)
@@ -338,16 +363,16 @@ def _joined(
     uv = np.concatenate([piece.uv for piece in pieces])
     uv = np.where(np.isnan(uv), vertices[:, :2] / (longest * scale) + 0.5, uv)
     mirrored = np.linalg.det(motion.matrices(moment)[:, :3, :3]) < 0
-    faces = [_outward(piece, mirrored) + start for piece, start in zip(pieces, starts, strict=False)]
+    faces = [outward(piece, mirrored) + start for piece, start in zip(pieces, starts, strict=False)]
     return Mesh(vertices, np.concatenate(faces), uv, all(piece.smooth for piece in pieces)), motion
 
 
-def _outward(piece: _Piece, mirrored: np.ndarray) -> np.ndarray:
+def outward(piece: FilePiece, mirrored: np.ndarray) -> np.ndarray:
     """Return the faces of a piece, wound the other way if its first joint mirrors it."""
     return piece.faces[:, ::-1] if mirrored[piece.owners[0, 0]] else piece.faces
 
 
-def _unscaled(pieces: list[_Piece], joints: list[Joint]) -> Skinned:
+def unscaled(pieces: list[FilePiece], joints: list[Joint]) -> Skinned:
     """Return all pieces as one motion in the lengths of the file."""
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
     most = max(piece.owners.shape[1] for piece in pieces)
@@ -365,7 +390,7 @@ def _unscaled(pieces: list[_Piece], joints: list[Joint]) -> Skinned:
     )
 
 
-def _check_reach(document: Document, body: Skinned) -> float:
+def check_reach(document: Document, body: Skinned) -> float:
     """Return a distance [m] that no vertex exceeds; `ValueError` if that is too far."""
     with np.errstate(over="ignore", invalid="ignore"):
         reach = _reach(body)

@@ -180,15 +180,30 @@ class Document:
         return np.ndarray((count, numbers), kind, data, start + offset, (stride, kind.itemsize))
 
 
-def open_document(path: Path) -> Document:
-    """Return a .glb or .gltf file of version 2; `FileNotFoundError`, or `ValueError` with the name of the file."""
+def open_document(path: Path, known: tuple[str, ...] = KNOWN_EXTENSIONS) -> Document:
+    """Return a .glb or .gltf file of version 2; `FileNotFoundError`, or `ValueError` with the name of the file.
+
+    `known` are the beginnings of the names of extensions that it may require.
+    """
     content, chunk = _read(path)
     version = convert(content, Root, str(path))["asset"]["version"]
     if not version.startswith("2."):
         raise ValueError(f"{path}: glTF of version {version[:20]}; version 2.0 is read")
-    refuse_required(path, content)
+    refuse_required(path, content, known)
     buffers = entries_of(path, content, "buffers")
     return Document(path, content, tuple(_buffer(path, i, each, chunk) for i, each in enumerate(buffers)))
+
+
+def files_of(path: Path) -> set[Path]:
+    """Return the files beside a .glb or .gltf file that its buffers and pictures are in."""
+    content, _ = _read(path)
+    found = set()
+    for kind in ("buffers", "images"):
+        for i, entry in enumerate(entries_of(path, content, kind)):
+            uri = entry.get("uri") if isinstance(entry, dict) else None
+            if isinstance(uri, str) and not uri.startswith("data:"):
+                found.add(file_beside(path, f"{path}: {kind}[{i}]", unquote(uri)).resolve())
+    return found
 
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes | None]:
@@ -210,12 +225,12 @@ def _without_nulls(content: Any) -> Any:
     return [_without_nulls(each) for each in content] if isinstance(content, list) else content
 
 
-def refuse_required(path: Path, content: Mapping[str, Any]) -> None:
+def refuse_required(path: Path, content: Mapping[str, Any], known: tuple[str, ...] = KNOWN_EXTENSIONS) -> None:
     """Raise `ValueError` for a file that cannot be understood without an extension that is not read."""
     needed = content.get("extensionsRequired", [])
     if not isinstance(needed, list) or not all(isinstance(name, str) for name in needed):
         raise ValueError(f"{path}: extensionsRequired: expected a list of names")
-    unknown = [name for name in needed if not name.startswith(KNOWN_EXTENSIONS)]
+    unknown = [name for name in needed if not name.startswith(known)]
     if unknown:
         raise ValueError(
             f"{path}: needs the extension {', '.join(f'{name:.60}' for name in unknown)}, which is not read; export "

@@ -24,6 +24,9 @@ Indices = list[Count]
 
 
 class Node(TypedDict):
+    name: NotRequired[str]
+    camera: NotRequired[Count]
+    extensions: NotRequired[dict[str, Any]]
     children: NotRequired[Indices]
     mesh: NotRequired[Count]
     skin: NotRequired[Count]

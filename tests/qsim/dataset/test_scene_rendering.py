@@ -14,6 +14,7 @@ from qsim.dataset.scene_rendering import SIDE, TemporaryFolder, load_scene, rend
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
 from qsim.rendering.budget import Budget
+from qsim.rendering.render_settings import RenderSettings
 from qsim.scene import Spin, Translation
 from qsim.scene.camera_path import write_camera_path
 
@@ -35,17 +36,17 @@ def test_a_family_its_record_and_its_file_give_the_same_clip(tmp_path: Path):
 
 def test_sizes_default_to_the_camera_of_a_record_and_to_a_small_square(tmp_path: Path):
     record = scenes.load("fan").resized(9, 8)
-    size = load_scene(record, None, None, 0, None)[0].camera
+    size = load_scene(record, 0, None, RenderSettings())[0].camera
     assert (size.height, size.width) == (9, 8)
-    assert load_scene(record, None, 5, 0, None)[0].camera.width == 5
-    family = load_scene("fan", None, 40, 0, None)[0].camera
+    assert load_scene(record, 0, None, RenderSettings(width=5))[0].camera.width == 5
+    family = load_scene("fan", 0, None, RenderSettings(width=40))[0].camera
     assert (family.height, family.width) == (SIDE, 40)
     for source in (record, "fan", "lamp"):  # 0 gave the size of a record's camera
         for size in ({"height": 0, "width": 5}, {"height": 5, "width": 0}):
             with pytest.raises(ValueError, match=r"(height|width): expected a whole number from 1 to 100000, got 0"):
-                load_scene(source, **size, seed=0, speed=None)
+                render(source, **size)
     with pytest.raises(ValueError, match="has its motions already; leave speed= out"):
-        load_scene(record, None, None, 0, 2.0)
+        load_scene(record, 0, 2.0, RenderSettings())
     with pytest.raises(ValueError, match="no path is given"):
         render("fan", force=True)
     with pytest.raises(ValueError, match=r"no scene family 'fam' \(did you mean 'fan'\?\)"):
@@ -63,12 +64,14 @@ def test_a_camera_path_replaces_the_camera_of_a_scene(tmp_path: Path):
         np.testing.assert_allclose(pose, camera.pose(t / 2000.0), atol=1e-4)  # between two poses of the file
     assert clip.camera.lens == Lens(-0.05)
     assert clip.camera.focal_pixels == pytest.approx(camera.focal_pixels)
-    fast, _ = load_scene("fan", 12, 14, 0, 2.0, camera_path=file)
+    fast, _ = load_scene("fan", 0, 2.0, RenderSettings(height=12, width=14, camera_path=str(file)))
     np.testing.assert_allclose(fast.camera.pose(1 / 2000), camera.pose(1 / 1000), atol=1e-12)
     content = json.loads(file.read_text())
     del content["frame_rate"]
     file.write_text(json.dumps(content))
-    slow, _ = load_scene(scenes.load("fan"), 12, 14, 0, None, camera_path=file, frame_rate=50.0)
+    slow, _ = load_scene(
+        scenes.load("fan"), 0, None, RenderSettings(height=12, width=14, camera_path=str(file), frame_rate=50.0)
+    )
     np.testing.assert_allclose(slow.camera.pose(1 / 50), camera.pose(1 / 1000), atol=1e-12)
 
 

@@ -11,6 +11,7 @@ import pytest
 from qsim.dataset.scene_rendering import load_scene
 from qsim.rendering.budget import Budget
 from qsim.rendering.mitsuba_xml import read_mitsuba
+from qsim.rendering.render_settings import RenderSettings
 from qsim.rendering.renderer import Renderer
 
 SCENE = """<scene version="3.0.0"><integrator type="path"/>
@@ -83,8 +84,8 @@ def test_what_mitsuba_rejects_while_it_renders_is_one_sentence(tmp_path):
 def test_a_light_that_needs_colour_is_read_in_colour(tmp_path):
     path = write(tmp_path, light='<emitter type="sunsky"/>')
     with pytest.raises(ValueError, match="render with bands='rgb'"):
-        load_scene(str(path), None, None, 0, None)
-    scene, _ = load_scene(str(path), None, None, 0, None, "rgb")
+        load_scene(str(path), 0, None, RenderSettings())
+    scene, _ = load_scene(str(path), 0, None, RenderSettings(bands="rgb"))
     assert scene.bands is not None
     assert (scene.camera.height, scene.camera.width) == (28, 36)
 
@@ -95,7 +96,7 @@ def test_the_size_is_the_films_and_another_shape_is_reported(tmp_path):
     for (height, width), expected in sizes.items():
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            scene, _ = load_scene(path, height, width, 0, None)
+            scene, _ = load_scene(path, 0, None, RenderSettings(height=height, width=width))
         assert (scene.camera.height, scene.camera.width) == expected
         assert [str(each.message) for each in said if "the horizontal one is" in str(each.message)] == (
             [] if expected != (20, 20) else [str(said[0].message)]
