@@ -1,7 +1,7 @@
 """Measures what 1 % of hot pixels cost mergenet: without a map, with the scan of a recording, and with their true map.
 
     python benchmarks/hot_pixels.py                 # the table, half an hour on one core
-    python benchmarks/hot_pixels.py --dim 7         # what the scan finds in little light, in sums of 7 planes (or of 1)
+    python benchmarks/hot_pixels.py --found 7       # what the scan finds, in sums of 7 planes (or of 1)
     python benchmarks/hot_pixels.py --clean 200     # false positives over so many clips without hot pixels
 
 The camera and its scenes are those of tests/support/spad_camera.py, which shares no code with the program: sums of 7
@@ -34,8 +34,8 @@ SHAPE = (96, 96)
 PLANES = 7  # of a code
 CODES = 99
 SHARE = 0.01  # of hot pixels
-LIGHTS = (0.5, 2.0, 6.0)  # photons per pixel and code
-DIM = (0.1, 0.3, 1.0, 3.0)  # likewise
+LIGHTS = (0.1, 0.3, 1.0, 3.0)  # photons per pixel and code
+CLEAN_LIGHTS = (0.5, 2.0, 6.0)  # likewise, in clips without hot pixels
 BLURS = (1.0, 0.5, 0.25)  # px, of the lens in clips without hot pixels
 SENSOR = BinarySPAD(1.0, 0.0).of_planes(PLANES)
 PEAK = 2.5  # of the mean light
@@ -92,7 +92,7 @@ def clean_clips(count: int) -> tuple[int, int, int]:
         blur = BLURS[seed // 18 % len(BLURS)]
         motions = scenes(seed, blur) | {"still": spad_camera.still(spad_camera.texture(256, seed, blur), SHAPE)}
         name = list(motions)[seed % len(motions)]
-        light = LIGHTS[seed // len(motions) % len(LIGHTS)]
+        light = CLEAN_LIGHTS[seed // len(motions) % len(CLEAN_LIGHTS)]
         found: Scan = scan(codes_of(motions[name], light, np.zeros(SHAPE), seed))
         clips += 1
         wrong += bool(found.hot.any())
@@ -100,10 +100,10 @@ def clean_clips(count: int) -> tuple[int, int, int]:
     return clips, wrong, pixels
 
 
-def dim_rows(planes: int) -> Iterator[list[str]]:
-    """Yield the cells of the table of little light: motion, light, hot pixels that are found, and false ones."""
+def found_rows(planes: int) -> Iterator[list[str]]:
+    """Yield the cells of the table of the scan: motion, light, hot pixels that are found, and false ones."""
     sensor = BinarySPAD(1.0, 0.0).of_planes(planes)
-    for number, light in enumerate(DIM):
+    for number, light in enumerate(LIGHTS):
         for name, scene in scenes(number).items():
             hot, dark = spad_camera.hot_map(SHAPE, SHARE, number)
             told = []
@@ -120,9 +120,9 @@ def main(words: list[str]) -> None:
         clips, wrong, pixels = clean_clips(int(words[1]))
         print(f"{clips} clips without hot pixels: {wrong} with a false positive, {pixels} pixels of {clips * 96 * 96}")
         return
-    if words[:1] == ["--dim"]:
+    if words[:1] == ["--found"]:
         header = ("motion", "PPP", "found", "of those above the light", "false", "false without hot pixels")
-        print("\n".join(markdown_table(list(dim_rows(int(words[1]))), header)))
+        print("\n".join(markdown_table(list(found_rows(int(words[1]))), header)))
         return
     header = ("motion", "PPP", "clean, dB", "no map", "scan", "true map", "found", "false")
     print("\n".join(markdown_table(list(rows()), header)))
