@@ -330,6 +330,10 @@ def is_stream(json_path: Path) -> bool:
 def writing(folder: Path, on_wait: Callable[[], None] | None = None) -> Iterator[None]:
     """Hold the lock of a folder of streams; while another process holds it, wait after a call of `on_wait`."""
     folder.mkdir(exist_ok=True)
+    if folder.is_symlink():  # streams would be written anywhere
+        raise ValueError(
+            f"{folder}: is a link, and streams are written into the clip alone; put the folder itself there"
+        )
     lock = locks.Lock(folder / "lock")
     lock.acquire(wait=True, on_wait=on_wait)
     try:

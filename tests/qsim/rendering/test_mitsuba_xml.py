@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 from small_scenes import CAMERA, RATE
@@ -120,6 +122,18 @@ MEDIUM = """<shape type="sphere" id="fog"><bsdf type="null"/>
 def test_unsupported_files_and_motions_are_refused(tmp_path, parts, motions, message):
     with pytest.raises(ValueError, match=message):
         read_mitsuba(written(tmp_path, *parts), motions)
+
+
+def test_a_pipe_that_a_file_names_is_refused(tmp_path):
+    """Mitsuba waits for it; also in a file that is included, and in a folder that is searched."""
+    (tmp_path / "deep").mkdir()
+    os.mkfifo(tmp_path / "deep/pipe")
+    mesh = '<path value="deep"/><shape type="ply"><string name="filename" value="pipe"/></shape>'
+    (tmp_path / "inner.xml").write_text(f'<scene version="3.0.0">{mesh}</scene>')
+    (tmp_path / "outer.xml").write_text('<scene version="3.0.0"><include filename="inner.xml"/></scene>')
+    for name in ("inner.xml", "outer.xml"):
+        with pytest.raises(ValueError, match=r"pipe: is a folder, a pipe or a device"):
+            read_mitsuba(tmp_path / name)
 
 
 def test_a_missing_file_and_a_mixture_are_refused(tmp_path, room):

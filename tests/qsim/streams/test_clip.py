@@ -189,6 +189,15 @@ def test_a_stream_that_is_cut_while_it_is_open_says_so(tmp_path: Path):
         stream.codes(2, 3)
 
 
+def test_streams_are_not_written_through_a_link(tmp_path: Path):
+    clip = write_clip(tmp_path / "c", frames=2, height=6, width=8)
+    (tmp_path / "elsewhere").mkdir()
+    (clip.path / "streams").symlink_to("../elsewhere")
+    with pytest.raises(ValueError, match="streams: is a link, and streams are written into the clip"):
+        clip.sense("quiver-physical", ppp=3.25, bits=3)
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
 def test_a_stream_of_another_clip_is_not_of_this_one(tmp_path: Path):
     """A copied folder of streams; another name of the clip's own folder changes nothing."""
     first = write_clip(tmp_path / "a", frames=4, height=9, width=10)
