@@ -20,7 +20,6 @@ import numpy as np
 from msgspec import Meta
 
 from qsim.colour import luminance
-from qsim.kinds import Number
 from qsim.records import convert
 from qsim.scene.animated.gltf_buffers import Document
 from qsim.scene.animated.gltf_materials import Factor, Paints, Part, TextureInfo
@@ -40,8 +39,11 @@ LEAST_IOR = 1.001  # of a surface without a coat; Mitsuba needs one above 1
 WHITE: Colour = (1.0, 1.0, 1.0)
 
 
+Amount = Annotated[float, Meta(ge=0.0, le=1e9)]  # far above what any file means, far below what overflows
+
+
 class NormalInfo(TextureInfo):
-    scale: NotRequired[Number]
+    scale: NotRequired[Annotated[float, Meta(ge=-1e3, le=1e3)]]
 
 
 class Roughness(TypedDict):
@@ -58,12 +60,12 @@ class Surface(TypedDict):
     emissiveTexture: NotRequired[TextureInfo]
     emissiveFactor: NotRequired[tuple[Part, Part, Part]]
     alphaMode: NotRequired[Literal["OPAQUE", "MASK", "BLEND"]]
-    alphaCutoff: NotRequired[Annotated[float, Meta(ge=0.0)]]
+    alphaCutoff: NotRequired[Amount]
     extensions: NotRequired[dict[str, Any]]
 
 
 class Ior(TypedDict):
-    ior: NotRequired[Annotated[float, Meta(ge=0.0)]]
+    ior: NotRequired[Amount]
 
 
 class Transmission(TypedDict):
@@ -74,12 +76,12 @@ class Transmission(TypedDict):
 class Specular(TypedDict):
     specularFactor: NotRequired[Part]
     specularTexture: NotRequired[TextureInfo]
-    specularColorFactor: NotRequired[tuple[Number, Number, Number]]
+    specularColorFactor: NotRequired[tuple[Amount, Amount, Amount]]
     specularColorTexture: NotRequired[TextureInfo]
 
 
 class Strength(TypedDict):
-    emissiveStrength: NotRequired[Annotated[float, Meta(ge=0.0)]]
+    emissiveStrength: NotRequired[Amount]
 
 
 class Clearcoat(TypedDict):

@@ -9,7 +9,7 @@ multiplies watts. Sources: Khronos, glTF 2.0, section 3.10, and KHR_lights_punct
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, NotRequired, TypedDict
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import numpy as np
 from msgspec import Meta
@@ -34,7 +34,7 @@ PITCH = 1.1e-6  # m
 F_NUMBER = 2.8
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from our camera's axes (x right, y down, z forward) to those of glTF
 
-Strength = Annotated[float, Meta(ge=0.0)]
+Strength = Annotated[float, Meta(ge=0.0, le=1e15)]
 Angle = Annotated[float, Meta(gt=0.0, lt=math.pi)]
 
 
@@ -52,6 +52,10 @@ class CameraEntry(TypedDict):
 class Cone(TypedDict):
     innerConeAngle: NotRequired[Number]
     outerConeAngle: NotRequired[Number]
+
+
+class Extended(TypedDict):
+    extensions: NotRequired[dict[str, dict[str, Any]]]
 
 
 class LightEntry(TypedDict):
@@ -99,7 +103,8 @@ def light_of(
     document: Document, number: int, by: str, chain: tuple[Placed, ...], clock: Clock, moves: bool, coloured: bool
 ) -> PointLight | SpotLight | DirectionalLight:
     """Return a light that follows its node, in W, sr and m."""
-    extension = document.content.get("extensions", {}).get(PUNCTUAL, {})
+    about_file = convert(document.content, Extended, str(document.path))
+    extension = about_file.get("extensions", {}).get(PUNCTUAL, {})
     where = f"{document.path}: {PUNCTUAL}.lights[{number}]"
     lights = entries_of(document.path, extension, "lights")
     if number >= len(lights):

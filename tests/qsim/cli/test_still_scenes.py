@@ -47,9 +47,7 @@ def test_a_recipe_knows_that_an_xml_scene_stands_still_and_is_one(place):
     ):
         recipe.parse(head + "speed=2.0\n", place / "t.toml")
     again = "[[scenes]]\nfamily='still.xml'\nseeds=[1]\nsplit='val'\n"
-    with pytest.raises(
-        ValueError, match=r"scene still is in the splits 'train' and 'val'; the file is the same scene"
-    ):
+    with pytest.raises(ValueError, match=r"scene still is in the splits 'train' and 'val'; the file is the same scene"):
         recipe.parse(head + again, place / "t.toml")
     assert len(recipe.parse(head + "count=2\n", place / "t.toml").jobs) == 2
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gltf_files import Gltf
+from mutations import attempt, places, replaced
 from PIL import Image
 
 from qsim import scenes
@@ -28,7 +29,7 @@ from qsim.scene import (
     read_gltf,
 )
 from qsim.scene.animated.attached import Attached
-from qsim.scene.animated.gltf_scene import cameras_in
+from qsim.scene.animated.gltf_scene import INSTANCES, cameras_in
 
 TURN = [0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)]  # a quarter of a turn about y
 PUNCTUAL = "KHR_lights_punctual"
@@ -218,8 +219,8 @@ def test_instances_are_repeated(tmp_path: Path):
         "ROTATION": file.add([[0, 0, 0, 1], TURN, [0, 0, 0, 1]]),
         "SCALE": file.add([[1.0, 1, 1], [1, 1, 1], [-2, 1, 1]]),
     }
-    file.content["nodes"][1]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
-    file.content["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
+    file.content["nodes"][1]["extensions"] = {INSTANCES: {"attributes": attributes}}
+    file.content["extensionsRequired"] = [INSTANCES]
     (body,) = read(file, tmp_path).bodies
     assert body.mesh.vertices.shape == (12, 3)
     np.testing.assert_allclose(body.mesh.vertices[4:8, 2], (1, -1, -1, 1), atol=1e-6)
@@ -309,3 +310,66 @@ def test_several_cameras_are_chosen_by_name_or_by_the_seed(tmp_path: Path):
     for word, value in (("camera", "side"), ("start", 1.0)):
         with pytest.raises(ValueError, match=f"fan: {word} is for .glb and .gltf files"):
             scenes.load("fan", **{word: value})
+
+
+def everything(folder: Path) -> Gltf:
+    """Return a file with an animation, a light, a picture in all places, instances and colours of vertices."""
+    values = np.full((2, 2, 4), 128, np.uint8)
+    copies = {INSTANCES: {"attributes": {}}}
+    file = stage([{"mesh": 0}, {"mesh": 1, "extensions": copies}, {"children": [1], "scale": [2.0, 2, 2]}])
+    copies[INSTANCES]["attributes"]["TRANSLATION"] = file.add([[0.0, 0, 0], [4, 0, 0]])
+    file.content["images"] = [{"bufferView": file.view(png(values)), "mimeType": "image/png"}]
+    file.content["textures"] = [{"source": 0, "sampler": 0}]
+    file.content["samplers"] = [{"wrapS": 33648, "wrapT": 10497, "magFilter": 9729}]
+    info = {"index": 0, "texCoord": 0, "extensions": {"KHR_texture_transform": {"scale": [2.0, 1.0], "rotation": 0.1}}}
+    metal = {"baseColorTexture": info, "metallicRoughnessTexture": info, "baseColorFactor": [1.0, 1, 1, 1]}
+    extensions = {
+        "KHR_materials_ior": {"ior": 1.4},
+        "KHR_materials_specular": {"specularFactor": 0.5},
+        "KHR_materials_transmission": {"transmissionFactor": 0.5},
+        "KHR_materials_emissive_strength": {"emissiveStrength": 2.0},
+        "KHR_materials_clearcoat": {"clearcoatFactor": 0.5},
+    }
+    file.content["materials"] = [
+        {
+            "pbrMetallicRoughness": metal,
+            "normalTexture": info | {"scale": 1.0},
+            "emissiveTexture": info,
+            "emissiveFactor": [1.0, 1, 1],
+            "alphaMode": "MASK",
+            "alphaCutoff": 0.5,
+            "extensions": extensions,
+        },
+        {},
+    ]
+    file.content["meshes"].append(square(file, 1, COLOR_0=file.add(np.ones((4, 3)))))
+    keys = {"input": file.add([0.0, 1.0]), "output": file.add([[0.0, 0, 0, 1], TURN]), "interpolation": "LINEAR"}
+    channels = [{"sampler": 0, "target": {"node": 3, "path": "rotation"}}]
+    file.content["animations"] = [{"name": "turn", "channels": channels, "samplers": [keys]}]
+    file.write(folder / "whole.glb")
+    return file
+
+
+def searched(folder: Path, only: slice) -> int:
+    """Read files of which one value is wrong; return how many were refused. Any other error is a fault."""
+    file = everything(folder)
+    content = file.content
+    refused = 0
+    for place in list(places(content))[only]:
+        for wrong in (None, -1, 1e300, "text", [], {}, 10**9, [[[]]]):
+            file.content = replaced(content, place, wrong)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                _, message = attempt(lambda: read(file, folder))
+            assert len(message.splitlines()) <= 1
+            refused += bool(message)
+    return refused
+
+
+def test_a_file_with_a_wrong_value_is_read_or_refused(tmp_path: Path):
+    assert searched(tmp_path, slice(None, None, 29)) > 10
+
+
+@pytest.mark.slow
+def test_every_wrong_value_is_read_or_refused(tmp_path: Path):
+    assert searched(tmp_path, slice(None)) > 500
