@@ -104,7 +104,13 @@ class Scratch:
             os.fsync(self._lock)
             _sync(self.folder)  # a power cut after the first rename leaves the record and the other files
             _sync(self._parent)
-        _finish(self.folder, [(new, name) for new, name, _ in moves])
+        waiting = [(new, name) for new, name, _ in moves]
+        try:
+            _finish(self.folder, waiting)
+        except BaseException:  # Ctrl-C between two renames: complete files get all their names
+            with contextlib.suppress(OSError):
+                _finish(self.folder, waiting)
+            raise
 
     @property
     def old(self) -> Path:

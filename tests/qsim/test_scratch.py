@@ -169,3 +169,27 @@ def test_a_lock_takes_nobody_elses_name(tmp_path: Path, kind: str):
     lock.delete()
     assert os.lstat(path) == before
     assert np.frombuffer(precious.read_bytes(), np.uint8).size == len(locks.RECORD)
+
+
+def test_an_interruption_between_two_names_gives_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Else the codes have no description, and the same command takes them for somebody else's."""
+    replace = os.replace
+    calls = []
+
+    def interrupted(source: Path, target: Path) -> None:
+        calls.append(target)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    paths = (tmp_path / "a.npy", tmp_path / "a.json")
+
+    def write() -> None:
+        with files.replacing_described(*paths) as opened:
+            for file in opened:
+                file.write(b"new")
+
+    with pytest.raises(KeyboardInterrupt):
+        write()
+    assert sorted(tmp_path.iterdir()) == sorted(paths)

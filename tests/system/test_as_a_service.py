@@ -39,13 +39,14 @@ def search(work: Path, tmp_path_factory: pytest.TempPathFactory) -> Search:
 def check_condition(search: Search, condition: str) -> None:
     """Run a line in a condition, and compare with a quiet run."""
     place = search.place()
+    before = set(place.rglob("*"))
     code, _, told = search.server.run(place, search.line, condition=condition)
     said = f"{search.line}: {condition}: {code}: {told}"
     assert code == 0, said
     assert "Traceback" not in told, said
     search.compare(place, said)
     if condition == "narrow_mask":
-        made = [path for path in place.rglob("*") if path.is_file() and path.stat().st_ctime > place.stat().st_ctime]
+        made = [path for path in set(place.rglob("*")) - before if path.is_file()]
         assert not any(path.stat().st_mode & 0o077 for path in made), said
 
 
