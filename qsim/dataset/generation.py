@@ -354,8 +354,9 @@ def _locked(folder: Path, options: Options) -> Iterator[None]:
                 raise ValueError(f"{folder}: another generator is at work here; let it finish, or wait with wait=True")
         yield
     finally:
-        for lock in held:
-            lock.release()
+        for lock in held[1:]:  # of this shard
+            lock.delete()
+        held[0].release()
 
 
 def _is_data_set(folder: Path) -> bool:

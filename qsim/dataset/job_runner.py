@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 RenderJob = Callable[[Job, Path], object]  # renders a job's clip to a path; tests use a quick one
 
 FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")  # inside a data set
-BLOCK_FOLDERS = ("clips", "jobs", "logs", "locks", "work")  # those in which every block has a folder
+LOCKS = "locks/clips"  # of jobs; those of generators are in locks
+BLOCK_FOLDERS = ("clips", "jobs", "logs", LOCKS, "work")  # those in which every block has a folder
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,7 @@ def removed(folder: Path) -> str:
 
 def run_job(job: Job, folder: Path, make: RenderJob = render_job) -> Result:
     """Run the missing steps of a job. Failures are written to failed/ and returned, not raised."""
-    lock = locks.Lock(folder / "locks" / job.key)
+    lock = locks.Lock(lock_path(folder, job))
     try:
         make_block(folder, job)
         lock.acquire(wait=True)  # another process may still be ending with this job
@@ -191,6 +192,11 @@ def run_job(job: Job, folder: Path, make: RenderJob = render_job) -> Result:
         lock.release()
 
 
+def lock_path(folder: Path, job: Job) -> Path:
+    """Return the lock of a job."""
+    return folder / LOCKS / job.key
+
+
 def _do(job: Job, folder: Path, make: RenderJob) -> Result:
     """Make clip, streams and record; each is complete before the next begins."""
     started = time.monotonic()
@@ -212,12 +218,13 @@ def _do(job: Job, folder: Path, make: RenderJob) -> Result:
 
 
 def make_block(folder: Path, job: Job) -> None:
-    """Make the folders of a job's block, where a data set has blocks; not those of a data set that was removed."""
-    if job.block and not removed(folder):
-        for name in BLOCK_FOLDERS:
-            (folder / name / job.block).mkdir(parents=True, exist_ok=True)
-        for name in ("locks", "work"):
-            scratch.sweep(folder / name / job.block)
+    """Make the folders of a job's block, or of all where there are no blocks; not in a data set that was removed."""
+    if removed(folder):
+        return
+    for name in BLOCK_FOLDERS if job.block else (LOCKS,):
+        (folder / name / job.block).mkdir(parents=True, exist_ok=True)
+    for name in (LOCKS, "work") if job.block else (LOCKS,):
+        scratch.sweep(folder / name / job.block)
 
 
 def mark_failed(folder: Path, job: Job, message: str) -> None:

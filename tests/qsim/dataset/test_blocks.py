@@ -37,6 +37,11 @@ def test_clips_records_and_logs_lie_in_their_blocks(tmp_path: Path):
         assert (tmp_path / "d" / "jobs" / f"{key}.json").is_file()
         assert (tmp_path / "d" / "logs" / f"{key}.log").is_file()
     data = Dataset.open(tmp_path / "d")
+    for folder in ("clips", "jobs", "logs", "work", "failed", "locks/clips"):
+        for block in BLOCKS:
+            for place in (data.path / folder, (data.path / folder / block).parent, data.path / folder / block):
+                assert len(list(place.iterdir())) <= 2 if place.is_dir() else folder == "failed"
+    assert sorted(path.name for path in (data.path / "locks").iterdir()) == ["clips", "generate", "manifest"]
     assert check(data.path) == []
     assert [clip.name for clip in data.clips("test")] == ["tumble_0004"]
     assert all(one.differ == 0 and one.why is None for one in redraw(data.path))
