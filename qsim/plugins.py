@@ -150,6 +150,12 @@ def stated(kind: type) -> dict[str, Any]:
     return {} if found is None else {"plugin": asdict(found)}
 
 
+def made_again(model: str, stored: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
+    """Return an object of a class of others, in another process; `ValueError` where the class is not."""
+    kind, _ = stored_class(model, stored, "an object of another process")
+    return kind(**values)
+
+
 @functools.cache
 def _entries(group: str) -> dict[str, metadata.EntryPoint]:
     return {entry.name: entry for entry in metadata.entry_points(group=group)}

@@ -11,23 +11,36 @@ from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import Protocol, overload
 
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.dataset.series import Listing
 from qsim.files import sha256, to_json
 from qsim.streams.clip import Clip
 
-if TYPE_CHECKING:
-    from qsim.dataset.dataset import Dataset
+
+class Indexed(Protocol):
+    """A data set, as this list sees it."""
+
+    @property
+    def name(self) -> str:
+        """The name of the data set."""
+
+    @property
+    def listing(self) -> Listing:
+        """Its clips."""
+
+    def folder(self, index: int) -> Path:
+        """Return the folder of a clip."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClipsOfDataset:
     """Finished clips of one data set."""
 
-    data: Dataset
+    data: Indexed
     indices: Array  # int64, ascending
 
     def __len__(self) -> int:
@@ -64,7 +77,7 @@ class ClipsOfDataset:
 
     def digest(self) -> list[str]:
         """Return what tells these clips from others, whatever their folder."""
-        series = [series.digest for series in self.data.info.scenes]
+        series = [each.digest for each in self.data.listing.series]
         return [self.data.name, *series, sha256(self.indices.astype("<i8").tobytes())]
 
 

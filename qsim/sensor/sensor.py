@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import cache, lru_cache
 from math import prod
 from typing import Any, ClassVar
@@ -291,15 +291,11 @@ class Sensor(Distribution):
         return {"model": type(self).__name__, **asdict(self), **plugins.stated(type(self))}  # type: ignore[call-overload]
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickle a class of a named file by its description: another process has the module under no name."""
-        described = self.to_dict() if plugins.is_of_file(type(self)) else {}
-        return (_of_description, (described,)) if described else super().__reduce_ex__(protocol)
-
-
-def _of_description(described: dict[str, Any]) -> Sensor:
-    from qsim.sensor import devices
-
-    return devices.from_dict(described)
+        """Pickle a class of a named file by its source: another process has the module under no name."""
+        if not plugins.is_of_file(type(self)):
+            return super().__reduce_ex__(protocol)
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        return plugins.made_again, (type(self).__name__, plugins.stated(type(self))["plugin"], values)
 
 
 def _checked(photons: Array, engine: str) -> Array:
