@@ -231,7 +231,7 @@ def to_toml(found: Calibration, title: str, stem: str = "", *, own_pixels: bool 
             lines.append(f'{key} = "{_UNMEASURED[key]}"')
     if "dark_count_rate" in found.maps:
         hot = int(found.maps["hot_pixels"].sum())
-        lines += ["", f"# {hot} hot pixels, true in {stem}{_HOT_MAP}, which `quiver restore` takes as --defects"]
+        lines += ["", f"# {hot} hot pixels, true in {stem}{_HOT_MAP}, a map of defects for restoring"]
         mark = "" if own_pixels else "# "
         if not own_pixels:
             lines += ["# Every pixel gets its own dark counts by the two lines below, without their #"]

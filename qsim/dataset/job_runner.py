@@ -168,10 +168,10 @@ def run_job(job: Job, folder: Path, make: RenderJob = render_job) -> Result:
     lock = locks.Lock(lock_path(folder, job))
     try:
         make_block(folder, job)
-        lock.acquire(wait=True)  # another process may still be ending with this job
-        if record_path(folder, job.key).is_file():
-            return Result(job.name, "done")
         try:
+            lock.acquire(wait=True)  # another process may still be ending with this job
+            if record_path(folder, job.key).is_file():
+                return Result(job.name, "done")
             return _do(job, folder, make)
         except Exception as error:
             if isinstance(error, OSError) and (error.errno in files.FULL or removed(folder)):

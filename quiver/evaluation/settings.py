@@ -59,7 +59,7 @@ class EvaluateSettings:
     ] = None
     ppp: Annotated[
         tuple[Light, ...] | None,
-        setting("mean photons per pixel and code, with --planes of the sum; several: 3.25,9.75,26", unset="3.25"),
+        setting("mean photons per pixel and code, or of a sum; several: 3.25,9.75,26", unset="3.25"),
     ] = None
     bits: Annotated[tuple[Bits, ...] | None, setting("bits per code", unset="3; of a .toml file its own")] = None
     seed: Annotated[Seed | None, setting("seed of the test noise or of the random splits", unset="0")] = None

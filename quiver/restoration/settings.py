@@ -54,7 +54,7 @@ class RestoreSettings:
     ] = None
     ppp: Annotated[
         Light | None,
-        setting("mean photons per pixel and code, with --planes of the sum", unset="that of the stored stream"),
+        setting("mean photons per pixel and code, or of a sum", unset="that of the stored stream"),
     ] = None
     bits: Annotated[Bits | None, setting("bits per code", unset="3; of a .toml file its own, of truth values 1")] = None
     seed: Annotated[Seed | None, setting("seed of the noise, if a clip is sensed now", unset="0")] = None
