@@ -103,6 +103,7 @@ OTHER = """## Another renderer
 
 Blender's Cycles is another path tracer, by other people. On scenes with materials that both have, converged pictures of
 both are compared, and frames of equal error are timed: [beside Blender's Cycles](results/cycles.md).
+Scenes that Blender exports as glTF are read and rendered here: [beside Blender](results/blender.md).
 """
 
 TESTS = """## Which test checks which claim

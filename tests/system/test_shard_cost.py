@@ -231,7 +231,7 @@ def refused(place: Path, capsys, *words: object) -> str:
 
 def test_missing_or_unfinished_data_is_one_sentence(place, capsys):
     assert "no such data set" in refused(place, capsys, "--data", place / "none")
-    assert "No such file" in refused(place, capsys, "--alone", place / "none.json")
+    assert "no such file" in refused(place, capsys, "--alone", place / "none.json")
     assert "1 of 2 clips are not made yet, the first is fan_0001" in refused(
         place, capsys, "--shard", "2/3", "--data", unfinished(place)
     )
