@@ -21,9 +21,11 @@ LIMITS where it is started: `--memory-limit 4GiB --lifetime 1h --lifetime-stagge
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import logging
 import os
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +53,7 @@ class Cluster:
             client = distributed.Client(self.address, timeout=self.timeout)
         except (OSError, TimeoutError, ValueError) as error:
             raise ValueError(f"{self.address}: no Dask scheduler answers there ({_short(error)})") from None
-        with client:
+        with client, _quiet():
             waiting = iter(jobs)
             futures = {}
 
@@ -77,11 +79,28 @@ class Cluster:
                 running = distributed.as_completed(submit(IN_FLIGHT))
                 for future in running:
                     job = futures.pop(future)
+                    if future.cancelled():  # by nobody here: the client does so when it loses the scheduler
+                        raise ConnectionError(
+                            f"{self.address}: its Dask scheduler is gone; nothing is lost: start one and run the same "
+                            "command again"
+                        )
                     running.update(submit(1))
                     yield _result(future, job, folder)
                     future.release()
             finally:
                 client.cancel(list(futures))
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Dask's own reports of a lost scheduler, with tracebacks, out of the messages of a command."""
+    logger = logging.getLogger("distributed.client")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def task_key(folder: Path, job: Job) -> str:

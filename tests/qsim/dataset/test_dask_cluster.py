@@ -113,6 +113,25 @@ def test_a_killed_workers_job_is_finished_by_the_other_and_gives_the_files_of_a_
 
 
 @pytest.mark.slow
+def test_a_killed_scheduler_is_one_sentence_and_no_job_has_failed(tmp_path: Path, cluster: LocalCluster):
+    generate(SMALL, tmp_path / "local", Options(workers=0), make=make)
+    worker = cluster.worker()
+    folder = tmp_path / "far"
+    folder.mkdir()
+    with ThreadPoolExecutor() as pool:
+        far = pool.submit(generate, SMALL, folder, make=make_with_pause, run=Cluster(cluster.address, timeout=PATIENCE))
+        wait_for(lambda: worker.pid in half_done(folder), PATIENCE)
+        cluster.processes[0].kill()
+        with pytest.raises(ConnectionError, match="its Dask scheduler is gone; nothing is lost: start one and run"):
+            far.result(timeout=PATIENCE)
+    worker.kill()
+    worker.wait()
+    assert not list((folder / "failed").iterdir())
+    assert generate(SMALL, folder, Options(workers=0), make=make).failed == {}
+    assert tree(folder) == tree(tmp_path / "local")
+
+
+@pytest.mark.slow
 def test_folders_of_one_name_on_one_scheduler_do_not_get_each_others_results(tmp_path: Path, cluster: LocalCluster):
     """The second client starts while the first still holds all of its jobs, which have the same names."""
     cluster.worker()
