@@ -1,4 +1,4 @@
-"""Builds ten scenes in Blender, exports them as glTF, and renders them with Cycles.
+"""Builds twenty scenes in Blender, exports them as glTF, and renders them with Cycles.
 
     python blender_scenes.py FOLDER --samples 256
 
@@ -254,6 +254,131 @@ def cut_out() -> None:
     keyed(thing, "location", (-0.2, 0, 1.2), (0.6, 0, 1.3))
 
 
+def two_materials() -> None:
+    """A ball of two materials turns."""
+    sun()
+    thing = ball((0, 0, 0.8), surface("red", Base_Color=(0.8, 0.2, 0.2, 1)))
+    thing.data.materials.append(surface("green", Base_Color=(0.2, 0.8, 0.2, 1), Roughness=0.8))
+    for polygon in thing.data.polygons:
+        polygon.material_index = int(polygon.center.x > 0)
+    keyed(thing, "rotation_euler", (0, 0, 0), (0, 0, 1.2))
+
+
+def copies() -> None:
+    """Boxes share a mesh; one is mirrored, others are stretched."""
+    sun()
+    bpy.ops.mesh.primitive_cube_add(size=0.4, location=(-1, 0, 0.4))
+    first = painted(surface("blue", Base_Color=(0.5, 0.5, 0.8, 1), Roughness=0.9))
+    for i in range(5):
+        copy = first.copy()
+        bpy.context.collection.objects.link(copy)
+        copy.location = (-0.5 + 0.5 * i, 0.4 * i - 0.5, 0.4)
+        copy.rotation_euler = (0, 0, 0.3 * i)
+        copy.scale = (1, 1 + 0.2 * i, -1 if i == 2 else 1)
+
+
+def mapped() -> None:
+    """A picture is shifted, turned and scaled by a mapping node."""
+    sun()
+    made = textured(surface("painted", Roughness=0.9), picture("chequers", chequered()))
+    tree = made.node_tree
+    texture = next(node for node in tree.nodes if node.type == "TEX_IMAGE")
+    mapping = tree.nodes.new("ShaderNodeMapping")
+    places = tree.nodes.new("ShaderNodeUVMap")
+    tree.links.new(places.outputs[0], mapping.inputs["Vector"])
+    tree.links.new(mapping.outputs[0], texture.inputs["Vector"])
+    mapping.inputs["Scale"].default_value = (2, 3, 1)
+    mapping.inputs["Location"].default_value = (0.2, 0.1, 0)
+    mapping.inputs["Rotation"].default_value = (0, 0, 0.5)
+    bpy.ops.mesh.primitive_plane_add(size=2, location=(0, 0.5, 1), rotation=(1.2, 0, 0.2))
+    keyed(painted(made), "location", (0, 0.5, 1), (0.5, 0.5, 1))
+
+
+def vertex_colours() -> None:
+    """A plate shows the colours of its vertices."""
+    sun()
+    made = surface("colours", Roughness=0.9)
+    colours = made.node_tree.nodes.new("ShaderNodeVertexColor")
+    colours.layer_name = "Col"
+    base = made.node_tree.nodes["Principled BSDF"].inputs["Base Color"]
+    made.node_tree.links.new(colours.outputs["Color"], base)
+    bpy.ops.mesh.primitive_grid_add(
+        x_subdivisions=12, y_subdivisions=12, size=2, location=(0, 0.3, 1), rotation=(1.0, 0, 0)
+    )
+    thing = painted(made)
+    layer = thing.data.color_attributes.new("Col", "FLOAT_COLOR", "POINT")
+    for i, vertex in enumerate(thing.data.vertices):
+        layer.data[i].color = (0.2 + 0.3 * (vertex.co.x + 1), 0.5, 0.2 + 0.3 * (vertex.co.y + 1), 1)
+    keyed(thing, "location", (0, 0.3, 1), (0.4, 0.3, 1))
+
+
+def on_a_bone() -> None:
+    """A box is parented to a bone of a scaled armature."""
+    sun()
+    bpy.ops.object.armature_add(location=(0, 0, 0.2))
+    bones = here()
+    bones.scale = (1.5, 1.5, 1.5)
+    bone = bones.pose.bones[0]
+    bone.rotation_mode = "XYZ"
+    bpy.ops.mesh.primitive_cube_add(size=0.5, location=(0, 0, 1.7))
+    thing = painted(surface("box", Base_Color=(0.7, 0.4, 0.2, 1), Roughness=0.9))
+    thing.parent, thing.parent_type, thing.parent_bone = bones, "BONE", bones.data.bones[0].name
+    keyed(bone, "rotation_euler", (0, 0, 0), (0, 0, 1.0))
+
+
+def skin_and_shape() -> None:
+    """The tube of `armature` swells while it bends."""
+    armature()
+    tube = next(thing for thing in bpy.data.objects if thing.type == "MESH" and thing.vertex_groups)
+    tube.shape_key_add(name="rest")
+    fat = tube.shape_key_add(name="fat")
+    for vertex, moved in zip(tube.data.vertices, fat.data, strict=True):
+        moved.co = (vertex.co.x * 1.6, vertex.co.y * 1.6, vertex.co.z)
+    keyed(fat, "value", 0.0, 1.0)
+
+
+def camera_rig() -> None:
+    """The camera hangs on a scaled empty that turns."""
+    sun()
+    ball((0, 0, 0.6), surface("clay", Base_Color=(0.7, 0.6, 0.3, 1), Roughness=0.9))
+    bpy.ops.object.empty_add(location=(0, 0, 0))
+    rig = here()
+    rig.scale = (2, 2, 2)
+    view = bpy.context.scene.camera
+    view.parent = rig
+    view.matrix_parent_inverse = rig.matrix_world.inverted()
+    keyed(rig, "rotation_euler", (0, 0, 0), (0, 0, 0.2))
+
+
+def glass() -> None:
+    """A frosted glass ball stands before a box."""
+    sun()
+    clear = {"Base_Color": (1, 1, 1, 1), "Transmission_Weight": 1.0, "Roughness": 0.05, "IOR": 1.45}
+    ball((0, 0, 0.7), surface("glass", **clear))
+    bpy.ops.mesh.primitive_cube_add(size=0.6, location=(1, 0.8, 0.4))
+    painted(surface("box", Base_Color=(0.3, 0.3, 0.7, 1), Roughness=0.9))
+
+
+def see_through() -> None:
+    """A plate of 60 % opacity slides before a ball."""
+    sun()
+    bpy.ops.mesh.primitive_plane_add(size=1.6, location=(0, 0, 1.0), rotation=(0.9, 0.2, 0))
+    thing = painted(surface("veil", Base_Color=(0.8, 0.3, 0.3, 1), Roughness=0.9, Alpha=0.6))
+    keyed(thing, "location", (0, 0, 1), (0.6, 0, 1.1))
+    ball((0.4, 0.9, 0.6), surface("clay", Base_Color=(0.2, 0.6, 0.3, 1), Roughness=0.9))
+
+
+def edges() -> None:
+    """A cylinder is smooth around and sharp at its ends; Blender's monkey is smooth."""
+    sun()
+    bpy.ops.mesh.primitive_cylinder_add(vertices=24, radius=0.6, depth=1, location=(0, 0, 0.8))
+    thing = painted(surface("clay", Base_Color=(0.7, 0.6, 0.5, 1), Roughness=0.7))
+    bpy.ops.object.shade_smooth_by_angle(angle=0.6)
+    keyed(thing, "rotation_euler", (0, 0, 0), (0.5, 0.3, 0))
+    bpy.ops.mesh.primitive_monkey_add(size=0.8, location=(1.1, 0.4, 0.6))
+    painted(surface("monkey", Base_Color=(0.4, 0.5, 0.7, 1), Roughness=0.5), smooth=True)
+
+
 SCENES: dict[str, Callable[[], None]] = {
     scene.__name__: scene
     for scene in (
@@ -267,6 +392,16 @@ SCENES: dict[str, Callable[[], None]] = {
         sun_and_spot,
         metal,
         cut_out,
+        two_materials,
+        copies,
+        mapped,
+        vertex_colours,
+        on_a_bone,
+        skin_and_shape,
+        camera_rig,
+        glass,
+        see_through,
+        edges,
     )
 }
 

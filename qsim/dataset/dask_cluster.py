@@ -53,7 +53,7 @@ class Cluster:
             client = distributed.Client(self.address, timeout=self.timeout)
         except (OSError, TimeoutError, ValueError) as error:
             raise ValueError(f"{self.address}: no Dask scheduler answers there ({_short(error)})") from None
-        with client, _quiet():
+        with _quiet(), client:
             waiting = iter(jobs)
             futures = {}
 
