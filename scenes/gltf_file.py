@@ -69,11 +69,13 @@ def played(scene: Scene, file: str | Path) -> str:
     """Return a line that states what a scene of this file shows, how fast it moves, and what follows its end."""
     names = cameras_in(file)
     if names:
-        count = len(scene.bodies)
-        plays = [getattr(body.motion, "clock", None) for body in scene.bodies]
-        lengths = [clock.length for clock in plays if clock is not None]
-        moves = f"its animations of {lengths[0]:g} s, again and again, at {scene.speed:g} times their speed"
-        return f"shows {count} bodies of {file}" + (f" and plays {moves}" if lengths else "")
+        shown = f"shows {len(scene.bodies)} bodies of {file}"
+        clocks = [getattr(thing.motion, "clock", None) for thing in (scene.camera, *scene.bodies)]
+        lengths = [clock.length for clock in clocks if clock is not None]
+        if not lengths:
+            return f"{shown}, at rest"
+        rate = f"again and again, at {scene.speed:g} times their speed"
+        return f"{shown} and plays its animations of {lengths[0]:g} s, {rate}"
     body = scene.bodies[-1]
     assert isinstance(body.motion, Skinned)
     clock = body.motion.clock

@@ -261,6 +261,7 @@ def _is_instance(body: Body) -> bool:
 
 def _scene_dict(mi: Any, scene: Scene, smooth_weight: float) -> dict[str, Any]:
     parts: dict[str, Any] = {"type": "scene"}
+    surfaces: dict[int, Any] = {}
     for i, light in enumerate(scene.lights):
         parts |= _light(mi, scene, light, f"light{i}", smooth_weight)
     for i, body in enumerate(scene.bodies):
@@ -269,14 +270,14 @@ def _scene_dict(mi: Any, scene: Scene, smooth_weight: float) -> dict[str, Any]:
             group: dict[str, Any] = {"type": "shapegroup"}
             for k, (_, material, faces) in enumerate(_shapes(i, body)):
                 inner = f"mesh{k or ''}"
-                group[inner] = _mesh(mi, body.mesh, inner, body.mesh.vertices, material, faces)
+                group[inner] = _mesh(mi, body.mesh, inner, body.mesh.vertices, material, faces, surfaces)
             parts[f"group{i}"] = group
             first = mi.ScalarTransform4f(body.pose(0.0).tolist())
             parts[name] = {"type": "instance", "to_world": first, "group": {"type": "ref", "id": f"group{i}"}}
         else:
             world = _to_world(body.pose(0.0), body.vertices(0.0))
             for shape, material, faces in _shapes(i, body):
-                parts[shape] = _mesh(mi, body.mesh, shape, world, material, faces)
+                parts[shape] = _mesh(mi, body.mesh, shape, world, material, faces, surfaces)
     return parts
 
 
@@ -290,15 +291,26 @@ def _shapes(number: int, body: Body) -> list[tuple[str, materials.Material, rang
     return list(zip(names, body.material.materials, faces, strict=True))
 
 
-def _mesh(mi: Any, mesh: Mesh, name: str, vertices: Array, material: materials.Material, faces: range | None) -> Any:
+def _mesh(
+    mi: Any,
+    mesh: Mesh,
+    name: str,
+    vertices: Array,
+    material: materials.Material,
+    faces: range | None,
+    surfaces: dict[int, Any],
+) -> Any:
+    """Return a shape; `surfaces` has what was loaded of each material of a file, which many shapes may share."""
     properties = mi.Properties()
     if isinstance(material, materials.Glow):
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": _value(mi, material.radiance)})
         properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _value(mi, 0.0)})
     else:
-        properties["bsdf"] = mi.load_dict(_bsdf(mi, material))
+        shared = surfaces.get(id(material))
+        properties["bsdf"] = mi.load_dict(_bsdf(mi, material)) if shared is None else shared
     colours = None
     if isinstance(material, materials.MetallicRoughness):
+        surfaces[id(material)] = properties["bsdf"]
         if material.glows:
             emitter = {"type": "area", "radiance": _emission(mi, material.emission)}
             properties["emitter"] = mi.load_dict(emitter)

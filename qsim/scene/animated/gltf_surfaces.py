@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 import numpy as np
 from msgspec import Meta
 
+from qsim import limits
 from qsim.colour import luminance
 from qsim.records import convert
 from qsim.scene.animated.gltf_buffers import Document
@@ -36,6 +37,7 @@ MATERIALS = (  # extensions of materials that are read
     "KHR_materials_clearcoat",
 )
 LEAST_IOR = 1.001  # of a surface without a coat; Mitsuba needs one above 1
+PARTS = 5  # pictures of a material: colour, metal and roughness, normals, emission and opacity
 WHITE: Colour = (1.0, 1.0, 1.0)
 
 
@@ -100,6 +102,8 @@ class Surfaces:
         self._paints = paints
         self._coloured = coloured
         self._tell = tell
+        self._made: dict[tuple[int, bool], MetallicRoughness] = {}
+        self._texels = 0
 
     def surface(
         self, number: int | None, by: str, uv: np.ndarray | None, colours: np.ndarray | None
@@ -111,7 +115,27 @@ class Surfaces:
         if number is None:
             return MetallicRoughness(tint(WHITE, self._coloured), metallic=1.0, roughness=1.0)
         about = self._document.entry("materials", number, Surface, by)
-        return _Reading(self._document, self._paints, self._coloured, self._tell, number, about, uv).surface(colours)
+        key = (number, uv is None)
+        if key in self._made and colours is None:
+            return self._made[key]
+        reading = _Reading(self._document, self._paints, self._coloured, self._tell, number, about, uv)
+        found = reading.surface(colours)
+        self._count(found)
+        if colours is None and reading.fits_all:
+            self._made[key] = found
+        return found
+
+    def _count(self, surface: MetallicRoughness) -> None:
+        """Raise `ValueError` where the pictures of all surfaces have more pixels than a file may have."""
+        for value in vars(surface).values():
+            image = getattr(value, "image", None)
+            pixels = image.colours if isinstance(image, Picture) else image
+            self._texels += pixels.shape[0] * pixels.shape[1] if isinstance(pixels, np.ndarray) else 0
+        if self._texels > PARTS * limits.TEXELS:
+            raise ValueError(
+                f"{self._document.path}: the pictures of its materials have over {PARTS} x {limits.TEXELS} pixels in "
+                "all; export smaller ones"
+            )
 
 
 def tint(colour: Sequence[float], coloured: bool) -> float | Colour:
@@ -143,6 +167,7 @@ class _Reading:
         self._uv = uv
         self._where = f"materials[{number}]"
         self._tell = lambda what: tell(f"{self._where}: {what}")
+        self.fits_all = True  # whether the surface is the same on every mesh
         self._base = about.get("pbrMetallicRoughness", Roughness())
 
     def surface(self, colours: np.ndarray | None) -> MetallicRoughness:
@@ -294,7 +319,10 @@ class _Reading:
         if placed != self._paints.placing_of(self._number, self._where):
             self._tell(f"its {name} is left out, it lies elsewhere than the first picture of the material")
             return None
-        return self._paints.picture(info, self._where)
+        found = self._paints.picture(info, self._where)
+        # A picture that wraps differently along its axes is changed by how far the mesh's coordinates run.
+        self.fits_all = self.fits_all and found.wrap[0] == found.wrap[1]
+        return found
 
     def _tint(self, colour: Sequence[float]) -> float | Colour:
         return tint(colour, self._coloured)

@@ -15,6 +15,7 @@ from mutations import attempt, places, replaced
 from PIL import Image
 
 from qsim import scenes
+from qsim.cli.program import main
 from qsim.rendering.mitsuba_mesh import vertex_normals
 from qsim.scene import (
     Constant,
@@ -310,6 +311,22 @@ def test_several_cameras_are_chosen_by_name_or_by_the_seed(tmp_path: Path):
     for word, value in (("camera", "side"), ("start", 1.0)):
         with pytest.raises(ValueError, match=f"fan: {word} is for .glb and .gltf files"):
             scenes.load("fan", **{word: value})
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_the_command_renders_a_file_and_says_what_it_shows(tmp_path: Path, capsys, moves: bool):
+    file = stage([{"mesh": 0}])
+    if moves:
+        keys = {"input": file.add([0.0, 2.0]), "output": file.add([[0.0, 0, 0], [2, 0, 0]])}
+        channels = [{"sampler": 0, "target": {"node": 1, "path": "translation"}}]
+        file.content["animations"] = [{"channels": channels, "samplers": [keys]}]
+    path = file.write(tmp_path / "s.glb")
+    words = f"render {path} -o {tmp_path}/out --frames 2 --height 8 --psnr 20 --start 1 --camera view"
+    assert main(words.split()) == 0
+    said = capsys.readouterr().out
+    assert "2 frames of 8 x 16" in said
+    expected = "and plays its animations of 2 s, again and again, at 1 times" if moves else ", at rest"
+    assert f"shows 1 bodies of {path}{' ' if moves else ''}{expected}" in said
 
 
 def everything(folder: Path) -> Gltf:
