@@ -52,7 +52,7 @@ class Calibrate:
     ] = None
     own_pixels: Annotated[
         bool,
-        setting("spad: the file gives every pixel its measured dark counts, and fits frames of this size alone"),
+        setting("spad: the file gives every pixel its measured dark counts, and fits no larger frames"),
     ] = False
     paralyzable: Annotated[bool, setting("spad: every arrival restarts the dead time")] = False
     ignore_dead_time: Annotated[bool, setting("spad: model the counts as Poisson")] = False
