@@ -297,7 +297,7 @@ def unlike_windows(stream: Stream) -> list[str]:
     unlike = [name for name in stream.info.settings if name not in (*HONOURED, *STATED)]
     stated = replace(stream.info.sensing, bits=stream.info.bits)
     planes = stream.sensor.levels - 1 if stated.summed else stated.frames
-    if stream.timing != stated.timing(planes, stated.summed):
+    if stream.timing != stated.timing(planes, stated.summed and planes > 1):
         unlike.append(f"codes of {stream.info.planes_per_code} clip frames that its settings do not state")
     return unlike
 

@@ -122,6 +122,11 @@ def test_every_other_setting_is_refused(make_clip: ClipMaker):
     assert unlike_windows(SimpleNamespace(info=info, timing=Timing(3, summed=True))) == unlike
 
 
+def test_single_planes_are_windows_like_sums_of_them(make_clip: ClipMaker):
+    stream = make_clip(frames=4).sense("spad-320x240", planes=1, ppp=0.5)
+    assert unlike_windows(stream) == []
+
+
 # Runs
 
 
