@@ -133,6 +133,10 @@ class Sensing:
             if self.bits not in (None, self.planes.bit_length()):
                 depth = self.planes.bit_length()
                 raise ValueError(f"planes={self.planes}: their sum has {depth} bits, not {self.bits}; leave bits= out")
+        if self.planes is not None and self.slices != 1:
+            raise ArgumentError(
+                "slices", f"are of one exposure, and planes={self.planes} are exposed one by one; give one of them"
+            )
         if self.summed and self.slices != 1:
             raise ValueError("group sums planes, slices are of one exposure; give one of them")
         if self.row_order is not None and self.row_delay is None:

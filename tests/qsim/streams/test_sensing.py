@@ -166,6 +166,7 @@ def test_two_light_levels_share_their_random_numbers_and_another_seed_does_not(t
         ({"ppp": 0.0}, "ppp: expected a number from 1e-06 to 1e\\+06, got 0.0"),
         ({"ppp": 3.25, "lux": 1.0}, "give the light level as ppp or as lux, not both"),
         ({"group": True, "slices": 2}, "group sums planes, slices are of one exposure; give one of them"),
+        ({"planes": 7, "slices": 2}, "slices: are of one exposure, and planes=7 are exposed one by one; give one of"),
     ],
 )
 def test_settings_that_cannot_be_are_refused_before_a_clip_is_read(settings: dict, message: str):
