@@ -105,8 +105,10 @@ class PlaneSums(PlaneRange):
             raise ArgumentError("start", f"{start}: {where} has planes 0..{frames - 1}; give one of them")
         if stop > frames:
             raise ArgumentError("stop", f"{stop}: {where} has {frames} planes; give {frames} or less")
+        if stop <= start:
+            raise ArgumentError("stop", f"{stop}: ends before the first plane, {start}; give more than {start}")
         if stop - start < planes:
-            raise ValueError(f"{where}: {max(stop - start, 0)} planes are fewer than the {planes} of one code")
+            raise ValueError(f"{where}: {stop - start} planes are fewer than the {planes} of one code")
         step = self.every or planes
         return Sums(planes, start, step, (stop - start - planes) // step + 1)
 
@@ -186,12 +188,15 @@ class Sums:
             total += read(at, min(at + together, stop)).sum(axis=0, dtype=np.uint16)
         return total
 
-    def times(self, plane_rate: float, stated: Times | None = None) -> Times:
-        """Return the middle of each code: by the stamps of its planes, else seconds after the recording began."""
+    def times(self, rate: float, stated: Times | None = None, each: int = 1) -> Times:
+        """Return the middle of each code: by the stamps of its frames, else seconds after the recording began.
+
+        `rate` is that of the frames that are summed or chosen here, 1/s; `each` of them is a sum of so many planes.
+        """
         firsts = self.start + self.step * np.arange(self.codes)
         if stated is None:
-            values = (firsts + self.planes / 2) / plane_rate
-            return Times(tuple(values.tolist()), "s", f"middles of codes, counted at {plane_rate:g} planes per second")
+            values = (firsts + self.planes / 2) / rate
+            return Times(tuple(values.tolist()), "s", f"middles of codes, counted at {rate * each:g} planes per second")
         stamps = np.array(stated.values)
         values = (stamps[firsts] + stamps[firsts + self.planes - 1]) / 2
         return replace(stated, values=tuple(values.tolist()))

@@ -221,7 +221,7 @@ def to_stream(
     sensor, tables = _tables(capture, _sensor(recording, capture, many), height, width)
     model = recording.code_model if sensor.sums_planes else sensor.code_model
     chosen = taken.codes != length or taken.planes > 1
-    times = taken.times(capture.frame_rate, recording.times) if chosen else recording.times
+    times = taken.times(capture.frame_rate, recording.times, sums.summed or 1) if chosen else recording.times
     planes = many
     if planes == 1 and model == "binary_sum":
         planes = sensor.levels - 1

@@ -111,5 +111,5 @@ def _described(stream: Stream, taken: Sums) -> StreamInfo:
         planes_of=info.planes_of,
         orientation=info.orientation,
         source=info.source,
-        times=taken.times(info.frame_rate, info.times) if chosen else info.times,
+        times=taken.times(info.frame_rate, info.times, info.planes_per_code) if chosen else info.times,
     )

@@ -208,7 +208,7 @@ def summed(codes: Codes, asked: PlaneSums) -> Codes:
         ppp=None if codes.ppp is None else codes.ppp * sums.planes,
         shares=turns,
         sums=sums if codes.sums is None else sums.within(codes.sums),
-        times=sums.times(plane_rate, codes.times),
+        times=sums.times(plane_rate, codes.times, 1 if codes.sums is None else codes.sums.step),
     )
 
 
@@ -285,9 +285,10 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
             return part.view(np.uint8)
         if part.max() >= sensor.levels or part.min() < 0:
             t, y, x = (int(i) for i in np.argwhere((part < 0) | (part >= sensor.levels))[0])
+            wrong = "bits=" if sensor.levels == 1 << sensor.bits else "summed="
             raise ValueError(
                 f"{name}: code {part[t, y, x]} at (t, y, x) = {(t + start, y, x)}; a {sensor.bits}-bit sensor has "
-                f"0..{sensor.levels - 1}; give the right bits="
+                f"0..{sensor.levels - 1}; give the right {wrong}"
             )
         return part
 

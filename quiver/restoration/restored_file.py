@@ -121,6 +121,11 @@ def restore_to_file(
 def _described(codes: Codes, method: Restorer) -> VideoInfo:
     """Return what is known of a video before it is restored, and what must agree to resume it."""
     by_places = {"bands": "R, G, B", "by": "places of the mask, then demosaicing"}
+    plane_rate = None
+    times = codes.times
+    if codes.sums is not None:
+        plane_rate = codes.frame_rate * codes.sums.step
+        times = times or codes.sums.times(plane_rate)
     return VideoInfo(
         quiver=VERSION,
         method=method.name,
@@ -129,10 +134,10 @@ def _described(codes: Codes, method: Restorer) -> VideoInfo:
         white=codes.white,
         shape=codes.video_shape,
         frame_rate=codes.frame_rate,
-        plane_rate=None if codes.sums is None else codes.frame_rate * codes.sums.step,
+        plane_rate=plane_rate,
         planes_per_code=1 if codes.sums is None else codes.sums.planes,
         planes=None if codes.sums is None else codes.sums.range,
-        times=codes.times,
+        times=times,
         exposure=codes.exposure,
         sensor=codes.sensor.to_dict(),
         source=codes.source,

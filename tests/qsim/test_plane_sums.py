@@ -164,6 +164,7 @@ def test_sums_that_a_camera_made_are_told_to_every_command(camera_sums, capsys):
     np.testing.assert_array_equal(stream.codes(), camera_sums[2::2])
     assert (stream.sensor.levels, stream.info.planes_per_code, stream.exposure) == (201, 200, 0.01)
     np.testing.assert_allclose(stream.times, (2.5 + 2 * np.arange(5)) / 100)
+    assert stream.info.times.source == "middles of codes, counted at 20000 planes per second"
     sensor = BinarySPAD(1.0, 0.0).of_planes(200)
     expected = quiver.restore(camera_sums[2::2], "moment:3", sensor=sensor, exposure=0.01)
     spad = "--sensor spad-320x240 --summed 200 --frame-rate 100 --from 2 --every 2"
@@ -171,6 +172,11 @@ def test_sums_that_a_camera_made_are_told_to_every_command(camera_sums, capsys):
         assert quiver_main(f"restore {source} -o {name}.npy --method moment:3".split()) == 0
         assert OF_200 in capsys.readouterr().out
         np.testing.assert_array_equal(np.load(f"{name}.npy"), expected)
+    all_codes = "sums.npy -o all.npy --method moment:1 --sensor spad-320x240 --summed 200 --frame-rate 100 -q"
+    assert quiver_main(["restore", *all_codes.split()]) == 0
+    times = json.loads(Path("all.json").read_text())["times"]["values"]
+    np.testing.assert_allclose(times, (np.arange(12) + 0.5) / 100)
+    capsys.readouterr()
     assert main(["preview", "sums.npy", "-o", "p.png", "--summed", "200"]) == 0
     assert "0 black, 200 white" in capsys.readouterr().out
     dark = "calibrate --dark sums.npy 1e-4 -o s.toml --json --summed 200"
@@ -205,6 +211,8 @@ def test_sums_that_a_camera_made_are_told_to_every_command(camera_sums, capsys):
             "restore sums.npy -o r.npy --summed 200 --width 99 --sensor spad-320x240",
             "--summed: sums.npy: packed planes",
         ),
+        ("restore sums.npy -o r.npy --summed 70 --sensor spad-320x240", "has 0..70; give the right --summed"),
+        ("preview sums.npy -o p.png --summed 200 --from 7 --to 3", "--to: 3: ends before the first plane, 7; give"),
         ("evaluate --static sums.npy --summed 200 --bits 8", "--bits: sums of 200 planes are not clipped"),
     ],
 )
