@@ -70,7 +70,8 @@ def played(scene: Scene, file: str | Path) -> str:
     names = cameras_in(file)
     if names:
         shown = f"shows {len(scene.bodies)} bodies of {file}"
-        clocks = [getattr(thing.motion, "clock", None) for thing in (scene.camera, *scene.bodies)]
+        motions = [scene.camera.motion, *(body.motion for body in scene.bodies)]
+        clocks = [getattr(motion, "clock", None) for motion in motions]
         lengths = [clock.length for clock in clocks if clock is not None]
         if not lengths:
             return f"{shown}, at rest"
