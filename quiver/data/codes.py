@@ -132,13 +132,15 @@ def filled(codes: Codes, bad: Array | None) -> Codes:
 
     `ValueError` for a map of another size, and for one without a good pixel.
     """
-    if bad is None or not bad.any():
+    if bad is None:
         return codes
     if bad.shape != codes.shape[1:]:
         raise ValueError(
             f"{codes.name}: the map of defective pixels has {' x '.join(map(str, bad.shape))} pixels, the frames "
             f"{codes.shape[1]} x {codes.shape[2]}; give the map of this sensor, cut to these frames"
         )
+    if not bad.any():
+        return codes
     marked = bad if codes.defective is None else bad | codes.defective
     rows, columns = (1, 1) if codes.colour is None else codes.colour.tile  # neighbours of one colour fill a pixel
     places = {(i, j): marked[i::rows, j::columns] for i in range(rows) for j in range(columns)}

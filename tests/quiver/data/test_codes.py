@@ -17,7 +17,7 @@ from qsim.sensor.spad import BinarySPAD
 from qsim.streams.sensing import Sensing
 from qsim.streams.storing import sense
 from quiver.data.clips import open_clips
-from quiver.data.codes import array_codes, frame_reader, light_of, sensed
+from quiver.data.codes import array_codes, filled, frame_reader, light_of, sensed
 from quiver.data.illumination import Illumination
 from quiver.data.windows import as_input
 
@@ -53,6 +53,13 @@ def test_counting_pixels_with_a_memory_are_followed_as_by_qsim_sense(make_clip: 
     assert stored.info.drawn_by == "events"
     np.testing.assert_array_equal(now.read(0, 4), stored.codes(0, 4))
     np.testing.assert_array_equal(now.read(2, 3), stored.codes(2, 3))
+
+
+def test_a_map_without_defects_has_the_size_of_the_frames():
+    codes = array_codes(np.zeros((3, 4, 5), np.uint8), SENSORS[0], EXPOSURE)
+    assert filled(codes, np.zeros((4, 5), bool)) is codes
+    with pytest.raises(ValueError, match="has 3 x 5 pixels, the frames 4 x 5; give the map of this sensor"):
+        filled(codes, np.zeros((3, 5), bool))
 
 
 def test_codes_in_memory_are_checked():
