@@ -23,7 +23,7 @@ extensions = [
     "manual",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext", ".py": "markdown"}  # .py: the examples
-exclude_patterns = ["*.py", "manual/*", "results/*.json", "examples/results/*.json"]
+exclude_patterns = ["examples/own_parts", "*.py", "manual/*", "results/*.json", "examples/results/*.json"]
 suppress_warnings = ["ref.python"]  # some classes share a name, as Clip
 
 myst_enable_extensions = ["attrs_inline", "colon_fence", "deflist", "dollarmath"]
