@@ -168,10 +168,7 @@ def read_counts(
         if bits not in (None, stream.bits):
             raise ValueError(f"{path}: is a stream of {stream.bits} bits per code, not {bits}; give what it states")
         if exposure is not None and not math.isclose(exposure, stream.exposure, rel_tol=1e-3):  # typed by hand
-            raise ValueError(
-                f"{path}: is a stream of codes of {stream.exposure:g} s, not of {exposure:g} s; give what it states, "
-                "or convert it again with the true exposure="
-            )
+            raise _other_exposure(path, stream, exposure)
         if not bare:
             raise ValueError(f"{path}: is a stream, which states its layout; leave the options of raw files out")
         return cast(Array, stream.codes)
@@ -185,6 +182,15 @@ def read_counts(
     if array.ndim != 3 or array.size == 0:
         raise ValueError(f"{path}: expected frames [T, H, W], found shape {list(array.shape)}")
     return array
+
+
+def _other_exposure(path: Path, stream: Stream, exposure: float) -> ValueError:
+    """Return the error of an exposure [s] that a stream does not state."""
+    cure = "give what it states, or convert it again with the true exposure="
+    if stream.sums is not None and stream.sums.planes > 1:
+        planes = stream.sums.planes
+        cure = f"its codes are sums of {planes} planes: give summed={planes} and the exposure of one plane"
+    return ValueError(f"{path}: is a stream of codes of {stream.exposure:g} s, not of {exposure:g} s; {cure}")
 
 
 def sensor_of(found: Calibration) -> Sensor:

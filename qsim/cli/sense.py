@@ -84,6 +84,7 @@ def sense(asked: Sense, wanted: Annotated[tuple[Sensing, ...], {"sensor": "quive
                 before += len(clip)
                 facts = {"clip": str(clip.path), "stream": found.name, "file": str(found.path), "made": bool(drawn)}
                 facts["light"] = line
+                facts["rates"] = found.rates
                 made.append(facts | _light(found.info))
     if len(wanted) > 1:
         note("streams of a clip with the same --seed share their random numbers: another --seed makes them independent")
@@ -93,10 +94,11 @@ def sense(asked: Sense, wanted: Annotated[tuple[Sensing, ...], {"sensor": "quive
 
 
 def _line(made: dict[str, Any]) -> str:
-    """Return what was written where: `wrote STREAM.npy: 21 codes of 3 bits, 128 x 128 pixels; light ...`."""
+    """Return what was written where: `wrote STREAM.npy: 21 codes of 3 bits, 128 x 128 pixels, RATES; light ...`."""
     frames, height, width = made["shape"]
     kind = f"{frames} codes of {made['bits']} bit{'s' if made['bits'] > 1 else ''}, {height} x {width} pixels"
-    return f"{'wrote' if made['made'] else 'exists already:'} {made['file']}: {kind}; {made['light']}"
+    begun = "wrote" if made["made"] else "exists already:"
+    return f"{begun} {made['file']}: {kind}, {made['rates']}; {made['light']}"
 
 
 def _light(info: StreamInfo) -> dict[str, Any]:

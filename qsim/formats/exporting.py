@@ -133,7 +133,9 @@ def _check_ours(place: Path, description: Path, single: bool) -> None:
 def _cube(source: Clip | Stream, path: Path, _wanted: Export, _meta: dict[str, Any]) -> None:
     if isinstance(source, Clip) or source.bits != 1:
         what = "a clip holds light" if isinstance(source, Clip) else f"this stream has {source.bits}"
-        raise ValueError(f"{source.path}: a photon cube holds one bit per pixel, {what}; sense it with bits=1")
+        summed = isinstance(source, Stream) and source.sums is not None and source.sums.planes > 1
+        cure = "sums of planes have none: export the single planes" if summed else "sense it with bits=1"
+        raise ValueError(f"{source.path}: a photon cube holds one bit per pixel, {what}; {cure}")
     array_files.write_cube(path, _code_blocks(source), source.shape)
 
 

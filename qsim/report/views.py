@@ -107,14 +107,17 @@ def _clip_source(clip: Clip, chosen: str | None) -> Source:
     if clip.info.has_sharp:
         views["radiance"] = _light_view("radiance", "radiance of the exposure", unit, len(clip), clip.radiance)
     length = len(clip)
+    rates = ""
     if chosen is not None or clip.streams:
-        length, held = _held_views(clip, clip.stream(chosen or clip.streams[0]))
+        stream = clip.stream(chosen or clip.streams[0])
+        length, held = _held_views(clip, stream)
         views |= held
+        rates = stream.rates if chosen is not None else ""
     if clip.holds("u"):
         views["flow"] = _flow_view(clip)
     if clip.holds("Z"):  # clips of warped pictures have none
         views["depth"] = _depth_view(clip)
-    return Source(clip.name, length, clip.frame_rate, views)
+    return Source(clip.name, length, clip.frame_rate, views, rates)
 
 
 def _held_views(clip: Clip, stream: Stream) -> tuple[int, dict[str, View]]:
@@ -184,7 +187,7 @@ def _array_source(
         _refuse(path, "packed planes of 1 bit (width=)", bits=bits)
         return _packed_source(path, array, width, sums)
     if bits is None and (sums.planes or 1) > 1:
-        bits = 1
+        bits = _bits_of_planes(path, array)
     if sums.summed is not None:
         _refuse(path, "said to hold sums of planes (summed=)", bits=bits)
         bits = sums.summed.bit_length()
@@ -197,6 +200,13 @@ def _array_source(
         return checked_codes(path, np.asarray(array[start:stop]), bits, start)
 
     return _bare_source(path, bits, length, read, sums)
+
+
+def _bits_of_planes(path: Path, array: NDArray[Any]) -> int:
+    """Return the bits of single planes; `ValueError` for values that are none, as bytes of packed planes."""
+    if array[0].max() > 1:
+        raise ValueError(f"{path}: whole numbers above 1 are no single planes; of packed planes give width=")
+    return 1
 
 
 def _bare_source(

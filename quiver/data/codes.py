@@ -99,9 +99,12 @@ class Codes:
     @property
     def rates(self) -> str:
         """Return the rate of the codes, and where they are sums that of their planes, as text."""
-        if self.sums is None:
-            return f"{self.frame_rate:g} codes/s"
-        return self.sums.words(self.frame_rate * self.sums.step)
+        if self.sums is not None:
+            return self.sums.words(self.frame_rate * self.sums.step)
+        planes = self.sensor.levels - 1
+        if self.sensor.sums_planes and planes > 1:  # nothing states the planes: those of the sensor's codes
+            return Sums(planes, 0, planes, self.shape[0]).words(self.frame_rate * planes)
+        return f"{self.frame_rate:g} codes/s"
 
     @property
     def white(self) -> float:

@@ -131,7 +131,8 @@ def test_sense_prints_one_line_of_light(made: Path, capsys: pytest.CaptureFixtur
     code, out, _ = run(capsys, "sense", clip, "--bits", 2, "--ppp", 3.25)
     assert code == 0
     assert re.fullmatch(
-        r"wrote \S+/fan_0001/streams/quiver-physical_2bit_3.25ppp\.npy: 3 codes of 2 bits, 8 x 10 pixels; light "
+        r"wrote \S+/fan_0001/streams/quiver-physical_2bit_3.25ppp\.npy: 3 codes of 2 bits, 8 x 10 pixels, "
+        r"2000 codes/s; light "
         r"scaled by \S+ to 3.25 photons/pixel \(2.6 e-, equivalent to \S+ lx at 555 nm\)\n",
         out,
     )
