@@ -165,6 +165,8 @@ class Illumination:
                 "planes",
                 f"a sum of {planes} planes has {depth} bits, and {bits} are asked for; give planes= or bits= alone",
             )
+        if self._states_bits:
+            devices.plane_bits(self.sensor, planes)  # refuses a file of other bits
         made = self.but(group=True, slices=1, bits=depth)
         if planes == 2**depth - 1 and self.record is None and not self._states_bits:
             return made
