@@ -18,7 +18,7 @@ from qsim.checks import suggest
 from qsim.kinds import Speed
 from qsim.records import convert
 from qsim.scene import Scene
-from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
+from qsim.scene.animated.gltf_body import GLTF_SUFFIXES, animations_in
 from qsim.scenes import (
     asset_folder,
     crowd,
@@ -105,10 +105,18 @@ def load(
 
         return read_mitsuba(name, bands=bands)
     if str(name).endswith(GLTF_SUFFIXES):
+        _check_moves(name, speed=speed != 1 and not along_path, start=start is not None)
         return gltf_file.scene(seed, speed=speed, file=name, camera=camera, start=start or 0.0, bands=bands)
     if Path(name).is_dir() and not (Path(name) / "clip.json").is_file():
         return asset_folder.scene(seed, speed=speed, folder=name)
     raise ValueError(_no_scene(name))
+
+
+def _check_moves(name: str | Path, **given: bool) -> None:
+    """Raise `ValueError` for what was given of the animations of a glTF file that has none."""
+    for word, is_given in given.items():
+        if is_given and not animations_in(name):
+            raise ValueError(f"{name}: has no animation, nothing moves; leave {word}= out")
 
 
 def check_view(name: str | Path, camera: str | None, start: float | None) -> None:

@@ -321,8 +321,12 @@ def test_the_command_renders_a_file_and_says_what_it_shows(tmp_path: Path, capsy
         channels = [{"sampler": 0, "target": {"node": 1, "path": "translation"}}]
         file.content["animations"] = [{"channels": channels, "samplers": [keys]}]
     path = file.write(tmp_path / "s.glb")
-    words = f"render {path} -o {tmp_path}/out --frames 2 --height 8 --psnr 20 --start 1 --camera view"
-    assert main(words.split()) == 0
+    words = f"render {path} -o {tmp_path}/out --frames 2 --height 8 --psnr 20 --camera view"
+    if not moves:
+        for word in ("start", "speed"):
+            assert main(f"{words} --{word} 2".split()) == 2
+            assert f"has no animation, nothing moves; leave --{word} out" in capsys.readouterr().err
+    assert main((f"{words} --start 1" if moves else words).split()) == 0
     said = capsys.readouterr().out
     assert "2 frames of 8 x 16" in said
     expected = "and plays its animations of 2 s, again and again, at 1 times" if moves else ", at rest"
