@@ -230,7 +230,8 @@ def sun_and_spot() -> None:
     ball((0, 0, 0.6), surface("clay", Base_Color=(0.7, 0.7, 0.6, 1), Roughness=0.9))
     spot = lamp("SPOT", (-1.5, -2.0, 3.0), 400.0)
     aimed(spot, (0, 0, 0.5))
-    spot.data.spot_size, spot.data.spot_blend = 0.7, 0.4
+    spot.data.spot_size = 0.7
+    spot.data.spot_blend = 0.4
     turned = tuple(spot.rotation_euler)
     keyed(spot, "rotation_euler", turned, (turned[0], turned[1], turned[2] + 0.3))
 
@@ -322,7 +323,9 @@ def on_a_bone() -> None:
     bone.rotation_mode = "XYZ"
     bpy.ops.mesh.primitive_cube_add(size=0.5, location=(0, 0, 1.7))
     thing = painted(surface("box", Base_Color=(0.7, 0.4, 0.2, 1), Roughness=0.9))
-    thing.parent, thing.parent_type, thing.parent_bone = bones, "BONE", bones.data.bones[0].name
+    thing.parent = bones
+    thing.parent_type = "BONE"
+    thing.parent_bone = bones.data.bones[0].name
     keyed(bone, "rotation_euler", (0, 0, 0), (0, 0, 1.0))
 
 
@@ -422,12 +425,18 @@ def configure(samples: int, threads: int) -> None:
     scene = bpy.context.scene
     render = scene.render
     cycles = scene.cycles
-    render.engine, cycles.device = "CYCLES", "CPU"
-    render.threads_mode, render.threads = "FIXED", threads
-    render.resolution_x, render.resolution_y, render.resolution_percentage = WIDTH, HEIGHT, 100
+    render.engine = "CYCLES"
+    cycles.device = "CPU"
+    render.threads_mode = "FIXED"
+    render.threads = threads
+    render.resolution_x = WIDTH
+    render.resolution_y = HEIGHT
+    render.resolution_percentage = 100
     render.fps = FPS
     scene.view_settings.view_transform = "Raw"
-    cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = samples, False, False
+    cycles.samples = samples
+    cycles.use_adaptive_sampling = False
+    cycles.use_denoising = False
     cycles.pixel_filter_type = "BOX"
     cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = 16
     cycles.transparent_max_bounces = 16
