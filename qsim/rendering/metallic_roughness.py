@@ -4,8 +4,8 @@
 
 and a second coat over both. F is Schlick's reflection at the half vector, D and G are those of GGX (Trowbridge and
 Reitz) with alpha = roughness^2. Source: Khronos, glTF 2.0, appendix B, and KHR_materials_clearcoat. Both sides look
-alike. Light that scatters between facets is left out: a white metal loses 5 % of its light at a roughness of 0.5, and
-half of it at 1. Mitsuba's own `principled` has Disney's base, which is up to a tenth brighter than a diffuse one.
+alike. Light that scatters between facets is left out, so rough metals are darker than real ones. Mitsuba's own
+`principled` has Disney's base, which is brighter than a diffuse one.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ glowing bodies are rewritten, because Mitsuba traces every instance into the ker
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any
 
 import numpy as np
@@ -227,27 +228,25 @@ def film_pass(
 
 def lamp_pose(lamp: lights.AreaLamp) -> Array:
     """Return the matrix from the square -1..1 in x, y (facing +z) to the lamp in the world, float64 [4, 4]."""
-    forward = np.subtract(lamp.target, lamp.origin)
-    forward = forward / np.linalg.norm(forward)
+    side, up, forward = _facing(np.subtract(lamp.target, lamp.origin))
+    pose = np.eye(4)
+    pose[:3, :4] = np.column_stack([side * lamp.width / 2, up * lamp.height / 2, forward, lamp.origin])
+    return pose
+
+
+def _facing(direction: Array) -> tuple[Array, Array, Array]:
+    """Return unit vectors to the side, upwards and along a direction [3]."""
+    forward = direction / np.linalg.norm(direction)
     helper = (0.0, 1.0, 0.0) if abs(forward[1]) < 0.99 else (1.0, 0.0, 0.0)
     side = np.cross(helper, forward)
     side /= np.linalg.norm(side)
-    pose = np.eye(4)
-    pose[:3, :4] = np.column_stack(
-        [side * lamp.width / 2, np.cross(forward, side) * lamp.height / 2, forward, lamp.origin]
-    )
-    return pose
+    return side, np.cross(forward, side), forward
 
 
 def beam_pose(light: lights.SpotLight | lights.DirectionalLight) -> Array:
     """Return the matrix from a beam along +z to the light in the world, float64 [4, 4]."""
-    forward = np.asarray(light.direction, np.float64)
-    forward = forward / np.linalg.norm(forward)
-    helper = (0.0, 1.0, 0.0) if abs(forward[1]) < 0.99 else (1.0, 0.0, 0.0)
-    side = np.cross(helper, forward)
-    side /= np.linalg.norm(side)
     pose = np.eye(4)
-    pose[:3, :3] = np.column_stack([side, np.cross(forward, side), forward])
+    pose[:3, :3] = np.column_stack(_facing(np.asarray(light.direction, np.float64)))
     if isinstance(light, lights.SpotLight):
         pose[:3, 3] = light.position
     return pose
@@ -440,7 +439,14 @@ def _metallic_roughness(mi: Any, material: materials.MetallicRoughness) -> dict[
             "roughness": _share(mi, material.roughness),
             "eta": material.ior,
         }
-        inner |= {"spec_trans": _share(mi, material.transmission)} if glass else {}
+        if glass:
+            inner["spec_trans"] = _share(mi, material.transmission)
+        else:
+            warnings.warn(
+                "the scalar engine draws surfaces of glTF by Mitsuba's principled, brighter and without a clearcoat; "
+                "install LLVM for the engine",
+                stacklevel=2,
+            )
         surface = _tilted(mi, inner, material.relief)
         surface = surface if glass else {"type": "twosided", "inner": surface}
     else:

@@ -205,8 +205,8 @@ class VertexColours:
 class MetallicRoughness:
     """The surface of glTF 2.0: a diffuse base under a rough dielectric coat, mixed with a metal.
 
-    Where `transmission` is above 0 it is Disney's surface as Mitsuba computes it (Burley, 2015), whose base is up to a
-    tenth brighter than a diffuse one. Both sides look alike, but glass has an inside. A surface may also emit, on its
+    Where `transmission` is above 0 it is Disney's surface as Mitsuba computes it (Burley, 2015), whose base is brighter
+    than a diffuse one. Both sides look alike, but glass has an inside. A surface may also emit, on its
     outer side, and let a share of the light pass straight on.
     """
 
