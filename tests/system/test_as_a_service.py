@@ -12,22 +12,9 @@ from pathlib import Path
 import pytest
 from kill_server import KillServer
 from service import CONDITIONS
-from writing_commands import LINES, Search, write_work
+from writing_commands import LINES, Search
 
 QUICK = "qsim convert codes.npy c --layout codes --bits 3 --frame-rate 9"
-
-
-@pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what the lines name."""
-    folder = tmp_path_factory.mktemp("work")
-    write_work(folder)
-    return folder
-
-
-@pytest.fixture
-def server() -> KillServer:
-    return KillServer.shared()
 
 
 @pytest.fixture(scope="module")

@@ -31,11 +31,6 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def server() -> KillServer:
-    return KillServer.shared()
-
-
 def pipe(path: Path) -> None:
     path.unlink()
     os.mkfifo(path)

@@ -6,25 +6,9 @@ The right result is that of a run that nothing disturbed, with no file beside it
 from __future__ import annotations
 
 import random
-from pathlib import Path
 
 import pytest
-from kill_server import KillServer
-from writing_commands import LINES, Search, write_work
-
-
-@pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what the lines name."""
-    folder = tmp_path_factory.mktemp("work")
-    write_work(folder)
-    return folder
-
-
-@pytest.fixture
-def server() -> KillServer:
-    return KillServer.shared()
-
+from writing_commands import LINES, Search
 
 QUICK = (
     "qsim convert codes.npy c --layout codes --bits 3 --frame-rate 9",

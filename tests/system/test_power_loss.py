@@ -10,27 +10,12 @@ import pickle
 import random
 import re
 import shutil
-from pathlib import Path
 
 import pytest
-from kill_server import KillServer
 from power_loss import State, crashes, put
-from writing_commands import LINES, Search, write_work
+from writing_commands import LINES, Search
 
 RUNS = 60  # states of each command line in which it is run; `-m slow` alone
-
-
-@pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what the lines name."""
-    folder = tmp_path_factory.mktemp("work")
-    write_work(folder)
-    return folder
-
-
-@pytest.fixture
-def server() -> KillServer:
-    return KillServer.shared()
 
 
 class Cut:
