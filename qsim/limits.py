@@ -42,6 +42,7 @@ PIXELS = _limit(1 << 26, "pixels", "a frame, a page or a picture")
 CHUNK = _limit(1 << 29, "bytes", "a chunk of HDF5 or zarr, in memory")
 COUNTS = _limit(1 << 29, "counts", "a PTU or SDT file, or exposures of photon times, in memory")
 COUNT_BYTES = _limit(1 << 32, "bytes", "an array of photon counts (.npz), in memory")
+EVENTS = _limit(1 << 25, "events", "an event camera between two frames, in memory")
 DEFLATED = _limit(1032, "times", "the bytes of a compressed file, unpacked: the most that deflate shrinks")
 
 

@@ -3,6 +3,7 @@ from .defects.pixel_array import PixelArray as PixelArray
 from .devices import load as load
 from .drawn import DrawnSensor as DrawnSensor
 from .estimation import Response as Response
+from .event_camera import EventCamera as EventCamera
 from .packing import pack as pack
 from .packing import unpack as unpack
 from .qis import QIS as QIS
