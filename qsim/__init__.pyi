@@ -17,6 +17,7 @@ from .scene.scene import Scene as Scene
 from .sensor.counting import CountingSPAD as CountingSPAD
 from .sensor.devices import load as load_sensor  # noqa: F401  (public name)
 from .sensor.drawn import DrawnSensor as DrawnSensor
+from .sensor.event_camera import EventCamera as EventCamera
 from .sensor.packing import pack as pack
 from .sensor.packing import unpack as unpack
 from .sensor.qis import QIS as QIS
@@ -24,6 +25,7 @@ from .sensor.sensor import Sensor as Sensor
 from .sensor.spad import BinarySPAD as BinarySPAD
 from .sensor.spike import SpikeCamera as SpikeCamera
 from .streams.clip import Clip as Clip
+from .streams.event_stream import EventStream as EventStream
 from .streams.sensing import Sensing as Sensing
 from .streams.storing import replay as replay
 from .streams.storing import sense as sense

@@ -69,7 +69,12 @@ def sha256(source: bytes | memoryview | Path, most: int | None = None) -> str:
     if not isinstance(source, Path):
         return hashlib.sha256(source).hexdigest()
     with opening.opened(source, most=most) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        return digest_of(file)
+
+
+def digest_of(file: Any) -> str:
+    """Return the hexadecimal SHA-256 of an open file from its position on."""
+    return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def sync_folder(folder: Path) -> None:
@@ -216,7 +221,7 @@ def differs(path: Path, expected: str | None, most: int | None = None, beside: P
     """
     try:
         with opening.opened(path, most=most, beside=beside) as file:
-            same = hashlib.file_digest(file, "sha256").hexdigest() == expected
+            same = digest_of(file) == expected
     except FileNotFoundError:
         return [f"{path}: missing"]
     except ValueError as error:

@@ -23,8 +23,8 @@ _HEADER = ("stream", "sensor", "bits", "codes", "time [ms]", "photons", "PSNR [d
 class Compare:
     """What `qsim compare` compares."""
 
-    clip: Annotated[Path, setting("clip folder with streams", positional=True)]
-    streams: Annotated[tuple[Text, ...], setting("names of streams, comma-separated", unset="all")] = ()
+    clip: Annotated[Path, setting("clip folder with streams or events", positional=True)]
+    streams: Annotated[tuple[Text, ...], setting("names of streams and events, comma-separated", unset="all")] = ()
     span: Annotated[Positive | None, setting("seconds that are averaged", unset="the longest code")] = None
 
 

@@ -21,6 +21,7 @@ from qsim.plane_sums import AS_STORED, PlaneSums
 from qsim.restored_video import describes_restored
 from qsim.settings import setting, settings_of
 from qsim.streams.clip import Clip
+from qsim.streams.event_stream import EventStream, is_events
 from qsim.streams.stream import Stream, is_stream
 
 PICTURES = ("mp4", "png", "nerfstudio")  # kinds that show light through a transfer curve
@@ -35,7 +36,7 @@ class Convert:
     """What `qsim convert` reads and writes; the facts of its files are `Hints`."""
 
     input: Annotated[
-        Path, setting("a file, a folder, a clip, a stream (its .npy or .json), a data set", positional=True)
+        Path, setting("a file, a folder, a clip, a stream or events (.npy or .json), a data set", positional=True)
     ]
     output: Annotated[
         Path, setting("clip folder, stream name, .npy, .mp4 or .zarr, or a folder with --to", positional=True)
@@ -62,8 +63,9 @@ class Convert:
     to: Annotated[
         str | None,
         setting(
-            "kind of the output; pairs: codes, truth and flow in one .h5; challenge: cubes of colour planes with their "
-            "truth; nerfstudio: pictures and their poses, transforms.json (planes end before --until)",
+            "kind of the output; pairs: codes, truth and flow in one .h5; events: .h5 or .npz; challenge: cubes of "
+            "colour planes with their truth; nerfstudio: pictures and their poses, transforms.json (planes end before "
+            "--until)",
             unset="from the suffix of its name",
             section=OTHERS,
             choices=KINDS,
@@ -86,18 +88,25 @@ class Convert:
     def source(self) -> Path:
         """The input; of a stream its description, which the .npy of its codes names too."""
         beside = _description(self.input)
-        return beside if self.input.suffix == ".npy" and _is_stream(beside) else self.input
+        return beside if self.input.suffix == ".npy" and (_is_stream(beside) or _is_events(beside)) else self.input
 
     @property
     def is_ours(self) -> bool:
         """Whether a clip, a stream or a data set of qsim is written for others."""
         source = self.source
         ours = source.is_dir() and any((source / name).is_file() for name in ("clip.json", "dataset.json"))
-        return ours or _is_stream(source)
+        return ours or _is_stream(source) or self.is_events
+
+    @property
+    def is_events(self) -> bool:
+        """Whether events are written for others."""
+        return _is_events(self.source)
 
     @property
     def kind(self) -> str | None:
         """The kind of the output; None if neither --to nor its name says it."""
+        if self.to is None and self.is_events:
+            return "events"
         return self.to or _SUFFIXES.get(self.output.suffix)
 
     @property
@@ -119,6 +128,10 @@ def _is_stream(path: Path) -> bool:
     return path.suffix == ".json" and path.is_file() and is_stream(path)
 
 
+def _is_events(path: Path) -> bool:
+    return path.suffix == ".json" and path.is_file() and is_events(path)
+
+
 # ---- What cannot act
 
 
@@ -126,6 +139,8 @@ def _written(asked: Convert, acts: bool) -> str:
     """Return why an option of writing does not act on this kind of output; empty if it does."""
     if acts or not asked.is_ours or asked.kind is None:
         return ""
+    if asked.is_events:
+        return f"changes nothing in {asked.output}, which holds events"
     return f"changes nothing in {asked.output}, a {asked.kind} of {'light' if asked.is_light else 'codes'}"
 
 
@@ -161,6 +176,7 @@ IDLE = (
     "qsim convert out/challenge out/cubes --to challenge",
     "qsim convert out/room out/room_poses --to nerfstudio",
     "qsim convert out/fan/streams/spad.json out/fan_cube.npy",
+    "qsim convert out/fan/events/dvs_100ppp.json out/fan_events.h5",
     idle=IDLE,
 )
 def convert(asked: Convert, hints: Hints, sums: ConvertedSums) -> int:
@@ -176,6 +192,8 @@ def convert(asked: Convert, hints: Hints, sums: ConvertedSums) -> int:
 def _export_sums(asked: Convert, hints: Hints, sums: PlaneSums) -> list[tuple[Path, str]]:
     """Write sums of a stream's planes as a stream, or with a kind of output for others."""
     source = asked.source
+    if asked.is_events:
+        raise ValueError(f"{source}: holds events, and planes are summed and chosen in streams of codes")
     if asked.kind == "pairs":
         return [_pairs(asked, sums)]
     if asked.is_light:
@@ -204,8 +222,12 @@ def _wanted(asked: Convert, hints: Hints) -> exporting.Export:
 def _export(asked: Convert, hints: Hints) -> list[tuple[Path, str]]:
     source = asked.source
     wanted = _wanted(asked, hints)
+    if wanted.kind == "pairs" and asked.is_events:
+        raise ValueError(f"{source}: holds events, and pairs are codes with their truth; name a stream of codes")
     if wanted.kind == "pairs":
         return [_pairs(asked, AS_STORED)]
+    if asked.is_events:
+        return [exporting.described(EventStream.open(source), asked.output, wanted, force=asked.force)]
     if not (source / "dataset.json").is_file():
         opened = Stream.open(source) if source.suffix == ".json" else Clip.open(source)
         return [exporting.described(opened, asked.output, wanted, force=asked.force)]

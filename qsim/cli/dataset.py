@@ -235,16 +235,21 @@ class Sensors:
 def sensors(asked: Sensors) -> int:
     """Print the named sensors, or the keys of a sensor file."""
     from qsim.sensor.devices import DEVICES
+    from qsim.sensor.event_camera import CAMERAS
 
     if asked.keys:
         print_keys(documented_keys.of_sensor_files())
         return 0
     known = {name: device.what for name, device in DEVICES.items()}
     known |= dict.fromkeys(plugins.installed(plugins.SENSORS), "of an installed package")
-    width = max(map(len, known))
-    lines = [f"{name:{width}}  {what}" for name, what in known.items()]
-    more = "qsim sense CLIP --sensor NAME draws with one; qsim doctor --devices prints every number with its source"
-    output({"sensors": known}, [*lines, more])
+    events = {name: camera.what for name, camera in CAMERAS.items()}
+    width = max(map(len, known | events))
+    lines = [f"{name:{width}}  {what}" for name, what in (known | events).items()]
+    more = (
+        f"qsim sense CLIP --sensor NAME draws with one, qsim events CLIP --camera NAME with {' or '.join(events)}; "
+        "qsim doctor --devices prints every number of a sensor with its source"
+    )
+    output({"sensors": known, "event_cameras": events}, [*lines, more])
     return 0
 
 

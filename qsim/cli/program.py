@@ -23,6 +23,7 @@ PROGRAM = Program(
             "Render a scene into a clip: radiance, sharp frames, flow, depth, body ids.",
         ),
         "sense": ("qsim.cli.sense:sense", "Turn clips into few-bit streams, or draw one frame again and compare."),
+        "events": ("qsim.cli.events:events", "Draw what event cameras report of clips: changes of log light."),
         "generate": ("qsim.cli.dataset:generate", "Make a data set from a recipe; finished jobs are kept."),
         "plan": (
             "qsim.cli.dataset:plan",
@@ -44,7 +45,7 @@ PROGRAM = Program(
         "tradeoff": ("qsim.cli.tradeoff:tradeoff", "Bit depth against motion, light, read noise and data rate."),
         "compare": (
             "qsim.cli.compare:compare",
-            "Compare the streams of a clip: each averaged over the same span of time.",
+            "Compare the streams and events of a clip: each over the same span of time.",
         ),
         "calibrate": ("qsim.cli.calibrate:calibrate", "Measure a sensor from dark and flat frames; write its file."),
         "validate": (

@@ -64,7 +64,7 @@ def sense(asked: Sense, wanted: Annotated[tuple[Sensing, ...], {"sensor": "quive
     """Draw the streams that are missing, or one frame again."""
     if asked.force:
         running().after_interrupt = MAKES_AGAIN
-    clips = [clip for path in asked.paths for clip in _clips(path)]
+    clips = [clip for path in asked.paths for clip in clips_of(path)]
     if asked.replay:
         return _replay(asked, clips, wanted[0])
     made = []
@@ -133,7 +133,7 @@ def _replay(asked: Sense, clips: list[Any], sensing: Sensing) -> int:
     return 0 if differ == 0 else 1
 
 
-def _clips(path: Path) -> list[Any]:
+def clips_of(path: Path) -> list[Any]:
     """Return the clips of a data set, or the one clip of a folder."""
     from qsim.dataset.dataset import Dataset
     from qsim.streams.clip import Clip

@@ -6,6 +6,7 @@
     truth/000000.exr     u v bu bv valid Z id: flow to the next and the previous frame, validity, depth, body; zipped
     saturated/000000.exr 1 where light is a lower bound (see `Clip.saturated`), only for frames with such pixels; zipped
     streams/NAME.npy     codes, and NAME.json (stream.py)
+    events/NAME.npy      events of an event camera, and NAME.json (event_stream.py)
 
 A clip is written to NAME.part and renamed when complete; an interrupted run resumes there (writer.py).
 """

@@ -11,7 +11,10 @@ from typing import Any
 from qsim import descriptions, files, records
 from qsim.clip.clip_info import ClipInfo, frame_file
 
-OURS = r"clip\.json|(radiance|sharp|truth|saturated)/[0-9]{6,}\.exr|streams/lock|streams/[A-Za-z0-9._-]+\.(npy|json)"
+OURS = (
+    r"clip\.json|(radiance|sharp|truth|saturated)/[0-9]{6,}\.exr"
+    r"|(streams|events)/lock|(streams|events)/[A-Za-z0-9._-]+\.(npy|json)"
+)
 TRUTH = {  # channel of the EXR file -> quantity
     "u": "flow",
     "v": "flow",

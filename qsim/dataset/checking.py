@@ -26,6 +26,7 @@ from qsim.dataset.job_record import read_record, record_path, verify_job
 from qsim.files import Progress
 from qsim.restored_video import Restored, describes_restored
 from qsim.streams.clip import Clip
+from qsim.streams.event_stream import EventInfo, EventStream
 from qsim.streams.storing import stored
 from qsim.streams.stream import Stream, is_stream
 
@@ -54,9 +55,11 @@ def check(path: Path, progress: Progress | None = None, shard: Part | None = Non
     found = files.read_json(description)
     if "code_model" in found:
         return _checked(lambda: Stream.open(description), description, progress)
+    if found.get("format") == EventInfo.FORMAT:
+        return _checked(lambda: EventStream.open(description), description, progress)
     if describes_restored(found):
         return _checked(lambda: Restored.open(description), description, progress)
-    raise ValueError(f"{path}: expected a data set, a clip, a stream or a restored video")
+    raise ValueError(f"{path}: expected a data set, a clip, a stream, events or a restored video")
 
 
 def _refuse_shard(path: Path, shard: Part | None) -> None:

@@ -1,4 +1,4 @@
-"""Writes clips and streams for other programs: cubes, mp4, PNG, EXR, zarr, spike .dat, camera paths; with a .json."""
+"""Writes clips, streams and events for others: cubes, mp4, PNG, EXR, zarr, .dat, camera paths, .h5; with a .json."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ from qsim import files, records, scratch
 from qsim.clip.manifest import check_outside
 from qsim.colour import code_levels, peak
 from qsim.files import VERSION
-from qsim.formats import array_files, challenge, images, photon_times, raw_cameras, video
+from qsim.formats import array_files, challenge, event_files, images, photon_times, raw_cameras, video
 from qsim.scene.camera_path import camera_path
 from qsim.streams.clip import Clip
+from qsim.streams.event_stream import EventStream
 from qsim.streams.stream import Stream
 
 BLOCK = 16  # frames read at a time
+Source = Clip | Stream | EventStream
 
 
 @dataclass(frozen=True)
 class Export:
     """The format of an export."""
 
-    kind: str  # cube, mp4, png, exr, zarr, challenge, spike, photons, nerfstudio
+    kind: str  # cube, mp4, png, exr, zarr, challenge, spike, photons, nerfstudio, events
     transfer: str = "gamma 2.2"  # of pictures of light
     white: float | None = None  # light that becomes full scale; None: the 99.9th percentile
     lossless: bool = True  # of mp4
@@ -34,7 +36,7 @@ class Export:
     planes: int = challenge.PLANES  # of a cube of the challenge
 
 
-def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = False) -> Path:
+def export(source: Source, path: Path, wanted: Export, *, force: bool = False) -> Path:
     """Write a clip's light or a stream's codes for other programs, with PATH.json (or PATH/meta.json) beside it.
 
     `ValueError` if the kind cannot hold it: a photon cube holds one bit, an EXR holds light.
@@ -42,12 +44,14 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     if wanted.kind not in EXPORTS:
         raise ValueError(f"{path}: unknown kind {wanted.kind!r}; there are {', '.join(EXPORTS)}")
     check(source, wanted)
+    if isinstance(source, EventStream):
+        event_files.check(path, source)
     check_outside(path)
     if (path.exists() or path.is_symlink()) and not force:
         raise FileExistsError(f"{path}: exists; name another, or replace it with force=True")
     meta = _export_meta(source, wanted)
     path.parent.mkdir(parents=True, exist_ok=True)
-    single = wanted.kind in ("cube", "mp4", "spike", "photons")
+    single = wanted.kind in ("cube", "mp4", "spike", "photons", "events")
     side = path.with_name(path.name + ".json")
     scratch.sweep(path.parent)
     for place in [path, *([side] if single else [])]:
@@ -74,8 +78,12 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     return path
 
 
-def check(source: Clip | Stream, wanted: Export) -> None:
-    """Raise `ValueError` if the challenge or a camera path cannot hold this source; others check when they write."""
+def check(source: Source, wanted: Export) -> None:
+    """Raise `ValueError` if events, the challenge or a camera path cannot hold this source; others check on writing."""
+    if isinstance(source, EventStream) and wanted.kind != "events":
+        raise ValueError(f"{source.path}: holds events, which are written with to=events")
+    if wanted.kind == "events" and not isinstance(source, EventStream):
+        raise ValueError(f"{source.path}: holds no events; draw some with `qsim events`, and name their .json")
     if wanted.kind == "challenge":
         if not isinstance(source, Clip):
             raise ValueError(f"{source.path}: is one stream, the challenge has three colours; name the clip's folder")
@@ -86,9 +94,11 @@ def check(source: Clip | Stream, wanted: Export) -> None:
         camera_file(source)
 
 
-def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = False) -> tuple[Path, str]:
+def described(source: Source, path: Path, wanted: Export, *, force: bool = False) -> tuple[Path, str]:
     """Export; return the path and one line: kind, frames, size, rates, white."""
     made = export(source, path, wanted, force=force)
+    if isinstance(source, EventStream):
+        return made, source.said
     side = made / "meta.json" if made.is_dir() else made.with_name(made.name + ".json")
     meta, (frames, height, width) = files.read_json(side), source.shape
     shown = f", played at {wanted.playback:g}" if wanted.kind == "mp4" else ""
@@ -206,6 +216,10 @@ def _spike(source: Clip | Stream, path: Path, _wanted: Export, meta: dict[str, A
     meta |= {"bit_order": "lsb", "orientation": "upside down"}
 
 
+def _events(source: Any, path: Path, _wanted: Export, _meta: dict[str, Any]) -> None:
+    event_files.write(source, path)
+
+
 def _photons(source: Clip | Stream, path: Path, _wanted: Export, meta: dict[str, Any]) -> None:
     if isinstance(source, Clip):
         raise ValueError(f"{source.path}: a clip has light, and no single photons; name one of its streams")
@@ -222,10 +236,11 @@ EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
     "spike": _spike,
     "photons": _photons,
     "nerfstudio": _nerfstudio,
+    "events": _events,
 }
 
 
-def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
+def _export_meta(source: Source, wanted: Export) -> dict[str, Any]:
     if isinstance(source, Clip):
         facts = {key: value for key, value in records.plain(source.info, complete=True).items() if value is not None}
         kept = ("shape", "frame_rate", "exposure", "radiance_unit", "scene", "split", "seed", "bands", "origin")
@@ -233,8 +248,10 @@ def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
     else:
         own = ("sha256", "software", "clip_key")  # of the stream's file
         found = {key: value for key, value in records.plain(source.info).items() if key not in own}
-    found |= {"format_version": 1, "bit_order": "msb", "software": {"qsim": VERSION}}
-    found["orientation"] = source.info.orientation
+    found |= {"format_version": 1, "software": {"qsim": VERSION}, "orientation": source.info.orientation}
+    if isinstance(source, EventStream):
+        return found | {"time_unit": "us", "time_zero": "middle of the exposure of frame 0"}
+    found["bit_order"] = "msb"
     if isinstance(source, Clip):
         written = {"exr": "linear", "zarr": "linear", "challenge": "srgb"}
         found["transfer"] = written.get(wanted.kind, wanted.transfer)

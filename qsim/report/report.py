@@ -45,7 +45,7 @@ from qsim.streams.stream import Stream
 _SENTENCES = 4
 _FACTS = 8
 _STORY = ("dataset", "training", "evaluation", "static", "restored", "study", "clip")  # the kinds in that order
-INSIDE_CLIPS = {"streams", "truth", "radiance", "sharp", "jobs", "failed", "logs", "locks", "work"}
+INSIDE_CLIPS = {"streams", "events", "truth", "radiance", "sharp", "jobs", "failed", "logs", "locks", "work"}
 
 
 def build_page(

@@ -36,6 +36,7 @@ from qsim.host import own_numbers
 from qsim.records import convert
 from qsim.sensor import file_laws
 from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.event_camera import CAMERAS, EventCamera
 from qsim.sensor.file_laws import NOTHING, Conditions
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
@@ -272,6 +273,8 @@ def load(
     if (plugin := plugins.load(str(name), plugins.SENSORS)) is not None:
         return _of_plugin(plugin, {"ppp": ppp, "bits": bits, "exposure": exposure})
     path = file_path(name)
+    if str(name) in CAMERAS:
+        raise ValueError(f"{name}: is an event camera, which has no codes; draw its events with `qsim events`")
     if path.suffix != ".toml":
         raise ValueError(f"unknown sensor {str(name)!r}{suggest(str(name), names())}; `qsim sensors` lists all")
     sensor = from_toml(path, bits, conditions)
@@ -432,6 +435,8 @@ def table_of(name: str | Path | Sensor) -> Mapping[str, object]:
 def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:
     """Return the sensor that `Sensor.to_dict` described: {"model": "QIS", field: value, ...}; strict, `ValueError`."""
     name = settings.get("model")
+    if name == EventCamera.__name__:
+        raise ValueError(f"{where}: is an event camera, which has no codes; draw its events with `qsim events`")
     if isinstance(name, str) and isinstance(settings.get("plugin"), Mapping):
         return _of_others(name, settings, where)
     if not isinstance(name, str) or name not in MODELS:

@@ -1,4 +1,7 @@
 from .clip import Clip as Clip
+from .event_sensing import EventSensing as EventSensing
+from .event_sensing import sense_events as sense_events
+from .event_stream import EventStream as EventStream
 from .photons import clip_photons as clip_photons
 from .photons import light_level as light_level
 from .sensing import Sensing as Sensing

@@ -1,4 +1,4 @@
-"""Defines `Clip`: a clip folder with the streams that were sensed from it, as notebooks use it.
+"""Defines `Clip`: a clip folder with the streams and events that were drawn from it, as notebooks use it.
 
 clip = qsim.render("fan", frames=21)
 stream = clip.sense("quiver-physical", ppp=3.25, bits=3)
@@ -7,7 +7,9 @@ clip[5], stream[5]      one frame: radiance, codes
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 
 from qsim import colour as pictures
 from qsim import files
@@ -21,6 +23,8 @@ from qsim.keys import hash_name
 from qsim.kinds import Text
 from qsim.sensor.sensor import Sensor
 from qsim.settings import taking
+from qsim.streams.event_sensing import EventSensing, sense_events
+from qsim.streams.event_stream import FOLDER, EventStream
 from qsim.streams.sensing import Sensing
 from qsim.streams.storing import sense
 from qsim.streams.stream import Stream
@@ -31,6 +35,14 @@ class _Asked(Sensing):
     """What `Clip.sense` takes: the settings of a stream, with a sensor to begin with, and how it is made."""
 
     sensor: Text | Sensor = "quiver-physical"
+    force: bool = field(default=False, kw_only=True)
+    progress: Progress | None = field(default=None, kw_only=True)
+
+
+@dataclass(frozen=True)
+class _AskedEvents(EventSensing):
+    """What `Clip.sense_events` takes: the settings of events, and how they are made."""
+
     force: bool = field(default=False, kw_only=True)
     progress: Progress | None = field(default=None, kw_only=True)
 
@@ -91,13 +103,41 @@ class Clip(ClipFolder):
         self._check_drawn_here(found)
         return found
 
-    def _check_drawn_here(self, stream: Stream) -> None:
+    def _check_drawn_here(self, stream: Stream | EventStream) -> None:
         """Raise `ValueError` for a stream that was drawn from another clip: a folder of streams that was copied."""
         if stream.info.clip_key not in (None, hash_name(self.name)):
             raise ValueError(
                 f"{stream.path}: was drawn from the clip {stream.info.clip!r}, and this one is {self.name!r}; take it "
                 "away, and draw a stream here with `qsim sense`"
             )
+
+    @taking(_AskedEvents)
+    def sense_events(self, asked: _AskedEvents) -> EventStream:
+        """Return the events that an event camera reports of this clip; they are stored in the clip's folder.
+
+        `camera` is an `EventCamera`, dvs, dvs-ideal, or a .toml file. `ppp` is the mean of photons per pixel and clip
+        frame, `lux` [lx] the light at 555 nm instead; with neither, the clip's own light is used. Events of equal
+        settings are not drawn again; `force` replaces those of other settings. `progress(done, total)` is called after
+        each frame. `ValueError` for settings that do not fit the clip, and for colour clips; `FileExistsError` where
+        `name` is taken by others.
+        """
+        wanted = EventSensing(**{each.name: getattr(asked, each.name) for each in fields(EventSensing)})
+        return self.event_stream(sense_events(self, wanted, force=asked.force, progress=asked.progress)[0].name)
+
+    @property
+    def event_streams(self) -> tuple[str, ...]:
+        """Names of the events drawn from this clip."""
+        return tuple(sorted(path.stem for path in (self.path / FOLDER).glob("*.json")))
+
+    def event_stream(self, name: str) -> EventStream:
+        """Open events by their name; `FileNotFoundError` lists the existing ones."""
+        path = self.path / FOLDER / f"{name}.json"
+        if not path.is_file():
+            known = ", ".join(self.event_streams) or "none yet; make some with `qsim events`"
+            raise FileNotFoundError(f"{self.path}: no events {name!r}; there are: {known}")
+        found = replace(EventStream.open(path), keeps=self.keeps)
+        self._check_drawn_here(found)
+        return found
 
     def verify(self, progress: Progress | None = None) -> list[str]:
         """Return one message per file whose checksum or size differs; empty if the clip is intact.
@@ -106,15 +146,18 @@ class Clip(ClipFolder):
         """
         problems = []
         stored = sorted(self.info.checksums.items())
-        streams = sorted((self.path / "streams").glob("*.json"))
+        opened: list[tuple[Path, Callable[[str], Stream | EventStream]]] = [
+            (path, self.stream) for path in sorted((self.path / "streams").glob("*.json"))
+        ]
+        opened += [(path, self.event_stream) for path in sorted((self.path / FOLDER).glob("*.json"))]
         report = progress or (lambda done, total: None)
-        total = len(stored) + len(streams)
+        total = len(stored) + len(opened)
         for done, (relative, expected) in enumerate(stored, 1):
             problems += files.differs(self.path / relative, expected, exr.largest(*self.shape[1:]), self.path)
             report(done, total)
-        for done, path in enumerate(streams, len(stored) + 1):
+        for done, (path, open_it) in enumerate(opened, len(stored) + 1):
             try:
-                problems += self.stream(path.stem).verify()
+                problems += open_it(path.stem).verify()
             except (ValueError, OSError) as error:
                 problems.append(files.wording(error))
             report(done, total)

@@ -21,6 +21,20 @@ from qsim.settings import setting
 from qsim.streams.exposures import Timing
 from qsim.streams.rows import Rows
 
+# Settings of all that is sensed
+AskedLux = Annotated[
+    Light | None, setting("faceplate lux at 555 nm, instead of ppp", unit="lx", varied=True, example=1.3)
+]
+AskedSeed = Annotated[Seed, setting("seed of the noise", example=1)]
+AskedPitch = Annotated[
+    Positive | None,
+    setting(
+        "metres, of a clip without a camera (imported video), so that its lux are known: 1.1e-6",
+        unit="m",
+        recipe=False,
+    ),
+]
+
 
 @dataclass(frozen=True)
 class Sensing:
@@ -45,10 +59,8 @@ class Sensing:
             example=[3.25, 26.0],
         ),
     ] = None
-    lux: Annotated[
-        Light | None, setting("faceplate lux at 555 nm, instead of ppp", unit="lx", varied=True, example=1.3)
-    ] = None
-    seed: Annotated[Seed, setting("seed of the noise", example=1)] = 0
+    lux: AskedLux = None
+    seed: AskedSeed = 0
     name: Annotated[
         Name | None, setting("name of the stream", unset="made from sensor, bits and light", short="o", example="dim")
     ] = None
@@ -110,14 +122,7 @@ class Sensing:
             "degrees C of a sensor file with dark_doubling", unit="degrees C", unset="the file's own", example=25.0
         ),
     ] = None
-    pixel_pitch: Annotated[
-        Positive | None,
-        setting(
-            "metres, of a clip without a camera (imported video), so that its lux are known: 1.1e-6",
-            unit="m",
-            recipe=False,
-        ),
-    ] = None
+    pixel_pitch: AskedPitch = None
 
     def __post_init__(self) -> None:
         for name in ("sensor", "defects", "colour"):

@@ -5,13 +5,12 @@ clip (radiance) --light level, optics--> photons --sensor, key--> codes --> stre
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 
 from numpy import ndarray as Array
 
-from qsim import locks, scratch
+from qsim import scratch
 from qsim.clip.clip_folder import ClipFolder
 from qsim.files import Progress, check_name
 from qsim.host import own_numbers
@@ -25,7 +24,7 @@ from qsim.streams.photons import light_line
 from qsim.streams.preparation import followed, prepare
 from qsim.streams.sensing import Sensing
 from qsim.streams.simulation import Draw
-from qsim.streams.stream import Stream, write_packed, writing
+from qsim.streams.stream import Stream, tidy, write_packed, writing
 from qsim.streams.stream_info import StreamInfo, StreamLight, stored_settings
 
 
@@ -113,7 +112,7 @@ def sense(
         line += f"; {missed}: {'photon by photon' if draw.followed else 'below ' + str(TOLERANCE) + ', closed form'}"
     kept = None if force else _kept(clip, sensing, info)
     if kept is not None:
-        _tidy(clip)
+        tidy(clip.path / "streams")
         return kept, line
     with writing(clip.path / "streams", on_wait):
         kept = None if force else _kept(clip, sensing, info)  # another process may have made it
@@ -170,12 +169,3 @@ def _write(clip: ClipFolder, name: str, blocks: Iterable[Array], info: StreamInf
     path = clip.path / "streams" / f"{check_name(name)}.npy"
     scratch.sweep(path.parent)
     return write_packed(path, blocks, info)
-
-
-def _tidy(clip: ClipFolder) -> None:
-    """Delete what a writer left that was killed after its stream was written."""
-    scratch.sweep(clip.path / "streams")
-    lock = locks.Lock(clip.path / "streams" / "lock")
-    with contextlib.suppress(OSError):  # a read-only folder
-        if lock.path.exists() and lock.acquire():
-            lock.delete()

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import colour, descriptions, files, locks
+from qsim import colour, descriptions, files, locks, scratch
 from qsim.checks import file_path
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
@@ -340,6 +340,15 @@ def writing(folder: Path, on_wait: Callable[[], None] | None = None) -> Iterator
         yield
     finally:
         lock.delete()
+
+
+def tidy(folder: Path) -> None:
+    """Delete what a writer left in a folder of streams that was killed after its stream was written."""
+    scratch.sweep(folder)
+    lock = locks.Lock(folder / "lock")
+    with contextlib.suppress(OSError):  # a read-only folder
+        if lock.path.exists() and lock.acquire():
+            lock.delete()
 
 
 def write_packed(path: Path, blocks: Iterable[Array], info: StreamInfo) -> Stream:

@@ -1,4 +1,4 @@
-"""Compares readouts of the same light: the streams of one clip, each averaged over the same span of time.
+"""Compares readouts of the same light: streams and events of one clip, each over the same span of time.
 
     codes within the span -> mean code -> exact inverse response -> photons per clip frame, against the sharp truth
 
@@ -7,11 +7,14 @@ the clip frame in the middle of the averaged codes, of an even number the later 
 own unit, so streams at other light levels are compared, too. A first row states the error of the light itself: the
 mean of the span without noise, which is what blur leaves. Of a stream with defects the response is that of its good
 pixels; remarks name what it leaves out.
+
+Events hold changes alone. Their row is given the light of the first frame and adds the contrast of all events since,
+each by the nominal threshold: what mismatch, noise and lost changes make of it grows with time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,10 +24,15 @@ from qsim.clip.clamped_error import rms
 from qsim.colour import psnr
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.sensor.estimation import Response
+from qsim.sensor.event_camera import EventCamera
 from qsim.streams.clip import Clip
+from qsim.streams.event_stream import SIZE, EventStream
 from qsim.streams.photons import clip_photons
 from qsim.streams.stream import Stream
 
+_GIVEN = (
+    f"its row is given the light of the first frame, and adds the contrast of all events since; {SIZE} bytes per event"
+)
 _POINTS = 1024  # of a response: interpolation errs by less than 2e-5 of the full scale, and 12 bits take seconds
 
 
@@ -34,8 +42,8 @@ class ReadoutRow:
 
     stream: str  # empty: the light without noise
     model: str  # of its sensor
-    bits: int | None
-    codes: int  # averaged for one estimate
+    bits: int | None  # of a code; None: there are none
+    codes: int  # averaged for one estimate; of an event camera the events of all pixels in a mean span
     seconds: float  # that these codes take
     ppp: float | None  # photons per pixel in these codes
     psnr_db: float  # against the sharp light, below 2.5 x the mean light of the clip
@@ -54,23 +62,24 @@ class Readouts:
 
 
 def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) -> Readouts:
-    """Return the comparison of streams (by default all) over `span` [s], by default the longest code of them.
+    """Return the comparison of streams and events (by default all) over `span` [s], by default the longest code.
 
     Instants end with the stream that ends first. `ValueError` for a clip of three bands or without streams, and for a
     span below a clip frame or above what all streams cover.
     """
     clip.require_one_band("a comparison of readouts")
-    streams = [clip.stream(name) for name in names or clip.streams]
-    if not streams:
-        raise ValueError(f"{clip.path}: has no streams to compare; make some with `qsim sense`")
+    streams, events = _named(clip, names)
+    if not streams and not events:
+        raise ValueError(f"{clip.path}: has no streams to compare; make some with `qsim sense` or `qsim events`")
     for stream in streams:
         stream.require_even("a comparison of readouts")
     frame = 1 / clip.frame_rate
-    seconds = max(frame * _frames_per_code(stream) for stream in streams) if span is None else span
+    longest = max((_frames_per_code(stream) for stream in streams), default=1)
+    seconds = frame * longest if span is None else span
     window = round(seconds / frame)
     covered = {stream.name: len(stream) * _frames_per_code(stream) for stream in streams}
-    first = min(covered, key=lambda name: covered[name])
-    end = min(covered[first], len(clip))
+    first = min(covered, key=lambda name: covered[name], default="")
+    end = min(covered.get(first, len(clip)), len(clip))
     if not 1 <= window <= end:
         where = "the clip has" if end == len(clip) else f"stream {first} covers"
         raise ValueError(
@@ -96,7 +105,56 @@ def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) ->
         found = np.stack([_estimate(stream, response, first, codes) for first in firsts])
         middles = [first * per_code + codes * per_code // 2 for first in firsts]
         rows.append(_row(stream, codes, codes * per_code * frame, score(found, middles)))
+    for each in events:
+        found = np.stack(list(_from_events(clip, each, centres)))
+        rows.append(_event_row(clip, each, window, score(found, centres)))
+        remarks.append(f"{each.name}: {_GIVEN}")
     return Readouts(clip.name, seconds, centres, tuple(rows), tuple(remarks))
+
+
+def _named(clip: Clip, names: Sequence[str]) -> tuple[list[Stream], list[EventStream]]:
+    """Return the streams and the events of these names, by default all; a name may be that of both."""
+    if not names:
+        return [clip.stream(name) for name in clip.streams], [clip.event_stream(name) for name in clip.event_streams]
+    events = [clip.event_stream(name) for name in names if name in clip.event_streams]
+    codes = [name for name in names if name in clip.streams or name not in clip.event_streams]
+    return [clip.stream(name) for name in codes], events
+
+
+def _from_events(clip: Clip, stream: EventStream, instants: Sequence[int]) -> Iterator[Array]:
+    """Yield photons per clip frame, float64 [H, W], at rising frames: the first frame and all contrast since."""
+    camera = stream.camera
+    height, width = clip.shape[1:]
+    per_photon = stream.info.light.factor * camera.quantum_efficiency / clip.exposure
+    first = np.log(clip_photons(clip, 0) * per_photon + camera.dark_current).ravel()
+    steps = np.array([-camera.threshold_off, camera.threshold_on])  # by polarity
+    contrast = np.zeros(height * width)
+    seen = 0.0
+    for t in instants:
+        until = (t + 0.5e-6) / clip.frame_rate  # events at the instant itself count
+        block = stream.between(seen, until)
+        seen = until
+        pixels = block["y"].astype(np.int64) * width + block["x"]
+        contrast += np.bincount(pixels, steps[block["p"]], height * width)
+        current = np.exp(first + contrast) - camera.dark_current
+        yield np.maximum(current / per_photon, 0).reshape(height, width)
+
+
+def _event_row(clip: Clip, stream: EventStream, window: int, psnr_db: float) -> ReadoutRow:
+    """Return the row of events; their rate is that of 8 bytes each."""
+    info = stream.info
+    seconds = window / clip.frame_rate
+    per_second = len(stream) / info.seconds
+    return ReadoutRow(
+        stream.name,
+        EventCamera.__name__,
+        None,
+        round(per_second * seconds),
+        seconds,
+        info.light.ppp * window,
+        psnr_db,
+        per_second * SIZE / 1e6,
+    )
 
 
 def _frames_per_code(stream: Stream) -> int:

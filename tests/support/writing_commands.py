@@ -15,6 +15,8 @@ from qsim.streams.storing import sense
 
 LINES = {  # what writes -> what it reads
     "qsim sense clip --ppp 3 --bits 3 --name n": ("clip",),
+    "qsim events clip --ppp 300 --camera dvs --name n": ("clip",),
+    **{f"qsim convert clip/events/e.json e.{kind}": ("clip",) for kind in ("h5", "npz")},
     "qsim convert codes.npy c --layout codes --bits 3 --frame-rate 9": ("codes.npy",),
     "qsim convert light.npy c --transfer linear --frame-rate 9": ("light.npy",),
     **{f"qsim convert clip e --to {kind}": ("clip",) for kind in ("png", "exr", "nerfstudio", "zarr")},
@@ -43,6 +45,7 @@ def write_work(folder: Path) -> None:
     sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, name="s"))
     sense(clip, Sensing("spad-320x240", name="b"))
     sense(clip, Sensing(CountingSPAD(0.5, 100.0, 2e-5, 3), ppp=3, follow=True, name="f"))
+    clip.sense_events("dvs", ppp=300, name="e")
     write_clip(folder / "fast", frames=16, height=16, width=24, frame_rate=20000.0, exposure=5e-5)
     write_dataset(folder / "data", {"train": 1, "val": 1}, frames=12, height=16, width=24)
     np.save(folder / "codes.npy", rng.integers(0, 4, (3, 16, 24)).astype(np.uint8))

@@ -139,6 +139,8 @@ def examples(shared) -> dict[str, Any]:
         "Scene": plate(Spin((0, 0, 1), 200.0)),
         "Sensing": qsim.Sensing("quiver-physical", ppp=3.25),
         "Stream": stream,
+        "EventCamera": qsim.EventCamera(),
+        "EventStream": clip.sense_events("dvs", ppp=100, name="events", force=True),
         "Response": SENSORS["QIS"].response(5e-4),
         "codes": stream.codes,
         "windows": quiver.windows(stream, frames=3, crop=4),

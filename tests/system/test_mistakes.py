@@ -244,7 +244,7 @@ MISTAKES = [
     ("qsim convert light.npy x --frame-rate 9 --columns 99", "--columns 99: the frames have 10 columns"),
     (
         "qsim convert lit x.webm",
-        "x.webm: name the kind of output with --to: challenge, cube, exr, mp4, nerfstudio, pairs,",
+        "x.webm: name the kind of output with --to: challenge, cube, events, exr, mp4, nerfstudio, pairs,",
     ),
     ("qsim convert lit x/y --to challenge", "lit: has no stream called red; the challenge has the streams red, green"),
     ("quiver restore lit -o x.zip", "lit: holds no cubes of the challenge; they are called SCENE/000000.npy"),

@@ -111,6 +111,10 @@ SITUATIONS = (
     Situation("sense clip --ppp 3.25 --bits 3", stdout, before="sense clip --ppp 3.25 --bits 3", only=("replay",)),
     replaces("sense clip --name s --seed 9", ""),
     Situation("sense wide", only=("threads",)),
+    # events
+    Situation("events clip"),
+    needs("events relative --lux 1", "pixel_pitch"),
+    replaces("events clip --ppp 300 --name n --seed 9", "events clip --ppp 300 --name n"),
     # generate, plan, check
     Situation(GENERATE, slow=True),
     Situation(GENERATE, names, only=("output",), slow=True),
@@ -251,6 +255,7 @@ COMMANDS = Commands(
         "colour": "rggb",
         "dataset": "b",
         "defects": "bad.toml",
+        "events.camera": "dvs-ideal",
         "explore.output": "other.html",
         "frame": "0",
         "frames": "3",
