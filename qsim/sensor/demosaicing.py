@@ -35,13 +35,10 @@ def demosaic(mosaic: Array, filters: ColourFilter, efficiency: float, *, floor: 
     rows, columns = filters.tile
     if height < rows or width < columns:
         raise ValueError(f"demosaicing: frames of {height} x {width} px are smaller than the tile, {rows} x {columns}")
-    weights = filters.weights(efficiency)
-    if not determines_bands(filters, efficiency):
-        raise ValueError(f"demosaicing: the mask {' '.join(filters.mask)} does not determine three bands")
-    kernels = _kernels(weights.tobytes(), rows, columns)
+    kernels = kernels_of(filters, efficiency)
     reach = kernels.shape[-1] // 2
-    y = _within(height, rows, reach)
-    x = _within(width, columns, reach)
+    y = within(height, rows, reach)
+    x = within(width, columns, reach)
     padded = np.asarray(mosaic, np.float64)[..., y[:, None], x]
     out = np.empty((*mosaic.shape[:-2], 3, height, width))
     for i, j in np.ndindex(rows, columns):
@@ -57,9 +54,22 @@ def determines_bands(filters: ColourFilter, efficiency: float) -> bool:
     return bool(np.linalg.matrix_rank(filters.weights(efficiency).reshape(3, -1), tol=1e-6) == 3)
 
 
-def _within(count: int, period: int, reach: int) -> Array:
-    """Return indices of a line with `reach` places before and after; those outside are the nearest of their phase."""
-    at = np.arange(-reach, count + reach)
+def kernels_of(filters: ColourFilter, efficiency: float) -> Array:
+    """Return the linear filters of a mask, float64 [rows, columns, 3, n, n]: one for each place of the tile and band.
+
+    `ValueError` for masks whose colours do not determine three bands.
+    """
+    if not determines_bands(filters, efficiency):
+        raise ValueError(f"demosaicing: the mask {' '.join(filters.mask)} does not determine three bands")
+    return _kernels(filters.weights(efficiency).tobytes(), *filters.tile)
+
+
+def within(count: int, period: int, before: int, after: int | None = None) -> Array:
+    """Return indices of a line with more places before and, by default as many, after.
+
+    Those outside are the nearest of their phase.
+    """
+    at = np.arange(-before, count + (before if after is None else after))
     at = np.where(at < 0, at % period, at)
     last = count - 1 - (count - 1 - at) % period
     return np.where(at >= count, last, at)

@@ -152,6 +152,7 @@ def network_of(settings: Settings, first: Path | None = None) -> Any:
     """
     from quiver.data.stream_windows import stream_at
     from quiver.model import weights
+    from quiver.model.mosaic_network import MosaicNet
     from quiver.model.presets import build
     from quiver.model.rivals.bit2bit import Bit2Bit
     from quiver.training.self_supervised import config_for
@@ -162,9 +163,10 @@ def network_of(settings: Settings, first: Path | None = None) -> Any:
     if first is None:
         return network
     loaded = weights.load(first)
-    if type(loaded) is not type(network) or loaded.config != network.config:
+    core: Any = loaded.core if isinstance(loaded, MosaicNet) else loaded
+    if type(core) is not type(network) or core.config != network.config:
         raise ValueError(
-            f"--start {first}: weights of {type(loaded).__name__} with another configuration than the "
+            f"--start {first}: weights of {type(core).__name__} with another configuration than the "
             f"preset {settings.network}; name the preset that they were trained with"
         )
     return loaded.train()

@@ -18,6 +18,7 @@ from typing import Any
 from qsim.checks import ArgumentError
 from qsim.files import sha256, to_json
 from qsim.sensor import colour_filter, devices
+from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.defects.defect_table import Defects, from_toml
 from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.file_laws import Conditions
@@ -28,15 +29,16 @@ from qsim.settings import given
 from qsim.streams.clip import Clip
 from qsim.streams.exposures import Timing
 from qsim.streams.preparation import assemble, prepare
-from qsim.streams.sensing import Sensing
+from qsim.streams.sensing import Sensing, filters_of
 from qsim.streams.simulation import Draw
 from qsim.streams.stream import Stream
 
 DEFAULT = Sensing("quiver-physical", bits=3, ppp=3.25)
 ALWAYS = ("sensor", "bits", "ppp")  # keys of every stored description
+TABLES = ("record", "defects", "colour")  # what it also has, as tables: the sensor, its defects and colour filters
 LEVEL = (*ALWAYS, "lux")  # settings that the text of a light states in its own words
 TIMES = ("group", "slices", "row_delay", "row_order", "exposures", "light_drift")  # when codes collect light
-HONOURED = (*LEVEL, *TIMES, "diffraction", "defects", "temperature", "pixel_pitch")
+HONOURED = (*LEVEL, *TIMES, "diffraction", "defects", "colour", "temperature", "pixel_pitch")
 STATED = ("seed", "name", "follow")  # settings that change no law of the codes
 OTHERS = "give sensor=, bits= and ppp=, in Python WindowSettings(lights=...)"  # where a stream's noise is of no use
 LONGEST = 500  # characters of a stored name
@@ -55,6 +57,7 @@ class Illumination:
     # What a stream or a run states, as JSON; None: a named device, or a file that is read when codes are drawn
     record: str | None = field(default=None)  # table [sensor], with the laws of its file
     defects: str | None = field(default=None)  # table [defects]; with a record, None is no defects
+    colour: str | None = field(default=None)  # table [colour], from the first pixel of the full frame; None: one band
 
     @classmethod
     def of(
@@ -83,10 +86,15 @@ class Illumination:
         if info.light is not None and (info.clip_key is None or pitched):
             settings.pop("lux", None)
             settings["ppp"] = info.light.ppp
+        colour = info.colour
+        if colour is not None:
+            y, x = stream.clip.origin
+            colour = colour.shifted(-y, -x)  # from the first pixel of the full frame on
         return cls(
             Sensing(info.sensor_name or str(info.sensor["model"]), bits=stream.bits, **settings),
             None if named else as_text(info.sensor),
             as_text(info.defects) if info.defects else None,
+            None if colour is None else as_text(colour.to_dict()),
         )
 
     @classmethod
@@ -95,10 +103,10 @@ class Illumination:
 
         The files of defect maps may be missing here: they are read when codes are drawn.
         """
-        if not isinstance(values, dict) or not {*ALWAYS, "record", "defects"} <= set(values):
-            raise ValueError(f"noise has {', '.join(ALWAYS)}, record and defects; got {repr(values)[:100]}")
+        if not isinstance(values, dict) or not {*ALWAYS, *TABLES} <= set(values):
+            raise ValueError(f"noise has {', '.join((*ALWAYS, *TABLES))}; got {repr(values)[:100]}")
         settings = dict(values)
-        stated = {name: settings.pop(name) for name in ("record", "defects")}
+        stated = {name: settings.pop(name) for name in TABLES}
         for name, table in stated.items():
             if table is not None and not isinstance(table, dict):
                 raise ValueError(f"noise: {name} is {repr(table)[:100]}")
@@ -112,12 +120,14 @@ class Illumination:
         made = cls(sensing, **texts)
         if made.record is not None:
             replace(made, defects=None).device(5e-4)  # checks the record; maps of defects may lie elsewhere
+        if made.colour is not None:
+            _ = made.filters  # checks the table
         return made
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON; settings that are off are left out."""
         values = {name: getattr(self.sensing, name) for name in ALWAYS} | given(self.sensing)
-        texts = {"record": self.record, "defects": self.defects}
+        texts = {name: getattr(self, name) for name in TABLES}
         return values | {name: None if text is None else json.loads(text) for name, text in texts.items()}
 
     @property
@@ -187,9 +197,10 @@ class Illumination:
         model = devices.MODELS.get(str(table.get("model")))
         return model is not None and model.sums_planes and "bits" not in table
 
-    def timed_as(self, other: Illumination) -> Illumination:
-        """Return the same with rows, shares and drift of another noise."""
-        return self.but(**{name: getattr(other.sensing, name) for name in TIMES if name not in ("group", "slices")})
+    def read_out_as(self, other: Illumination) -> Illumination:
+        """Return the same with rows, shares and drift of another noise, and with its colour filters if it has none."""
+        timed = self.but(**{name: getattr(other.sensing, name) for name in TIMES if name not in ("group", "slices")})
+        return replace(timed, colour=self.colour or other.colour)
 
     def over_as_many_as(self, other: Illumination) -> Illumination:
         """Return the same with codes over as many clip frames as those of another noise.
@@ -214,22 +225,38 @@ class Illumination:
         if self.record is not None or self.defects is not None:
             return self
         file = sensing.sensor if isinstance(sensing.sensor, str) and sensing.sensor.endswith(".toml") else None
-        if file is not None and colour_filter.from_toml(file) is not None:
-            raise ValueError(f"{file}: training windows have one band; leave its table [colour] out")
+        colour = self._stated_colour(file)
         table = sensing.defects or file
         found = from_toml(table, needed=sensing.defects is not None) if isinstance(table, str) else table
         defects = None if found is None else as_text(found.to_dict())
         if isinstance(sensing.sensor, Sensor):
             devices.check_known(sensing.sensor)
-            made = replace(sensing, sensor=self.sensor, bits=sensing.sensor.bits, defects=None)
-            return Illumination(made, as_text(sensing.sensor.to_dict()), defects)
+            made = replace(sensing, sensor=self.sensor, bits=sensing.sensor.bits, defects=None, colour=None)
+            return Illumination(made, as_text(sensing.sensor.to_dict()), defects, colour)
         if file is None:
             if sensing.temperature is not None:
                 self.device(5e-4)  # raises: a named device has no law of temperature
-            return Illumination(replace(sensing, defects=None), None, defects)
+            return Illumination(replace(sensing, defects=None, colour=None), None, defects, colour)
         bits = devices.load(file, bits=sensing.bits).bits
         record = as_text({**_with_own_spread(file, found), "bits": bits})
-        return Illumination(replace(sensing, bits=bits, defects=None), record, defects)
+        return Illumination(replace(sensing, bits=bits, defects=None, colour=None), record, defects, colour)
+
+    def _stated_colour(self, file: str | None) -> str | None:
+        """Return the table [colour] of the settings or of the sensor's file, as JSON; None without filters."""
+        found = filters_of(self.sensing)
+        if self.colour is not None or found is None:
+            return self.colour
+        if file is not None and "qe_curve" in devices.table_of(file):
+            raise ValueError(
+                f"{file}: its filters follow qe_curve, and training windows need their efficiency; sense a stream with "
+                "this file and train with the streams of the data set, or state [colour] efficiency"
+            )
+        return as_text(found.to_dict())
+
+    @property
+    def filters(self) -> ColourFilter | None:
+        """The colour filters, from the first pixel of the full frame; None: one band."""
+        return None if self.colour is None else stored_filters(self.colour)
 
     def device(self, exposure: float, wavelength: float | None = None) -> Sensor:
         """Return the sensor for codes of this exposure [s], in light of this wavelength [m, None: as cameras have]."""
@@ -244,6 +271,8 @@ class Illumination:
         not fit the clip.
         """
         sensing = replace(self.sensing, seed=seed)
+        if self.colour is not None:
+            sensing = replace(sensing, colour=self.filters)
         if self.record is None and self.defects is None:
             return prepare(clip, sensing)
         found = None if self.defects is None else stored_defects(self.defects)
@@ -258,6 +287,8 @@ class Illumination:
         left_out = (*LEVEL, "seed", "name", "group", "slices")
         rest = {name: value for name, value in given(self.sensing).items() if name not in left_out}
         found = [name if value is True else f"{name} {_short(value)}" for name, value in rest.items()]
+        if self.filters is not None:
+            found.append(f"mask {' '.join(self.filters.mask)}")
         if self.planes == 1:
             return found
         return [f"{self.planes} {'planes' if self.sensing.summed else 'slices'}", *found]
@@ -391,6 +422,12 @@ def ideal_counter(bits: int) -> Sensor:
 def as_text(values: Mapping[str, Any]) -> str:
     """Return JSON with sorted keys."""
     return json.dumps(values, sort_keys=True)
+
+
+@lru_cache(maxsize=64)
+def stored_filters(text: str) -> ColourFilter:
+    """Return the colour filters of a table [colour] in JSON."""
+    return colour_filter.from_dict(json.loads(text))
 
 
 @lru_cache(maxsize=64)

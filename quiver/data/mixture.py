@@ -105,7 +105,7 @@ def _changed(
     if sensor is not None and (sensor != noise.sensor or _is_file(sensor) or temperature is not None):
         depth = bits if bits is not None or _is_file(sensor) else noise.bits
         fresh = Illumination.of(sensor, noise.ppp, depth, temperature=temperature).over(planes, bits).stated()
-        fresh = fresh.but(lux=noise.sensing.lux, diffraction=noise.sensing.diffraction).timed_as(noise)
+        fresh = fresh.but(lux=noise.sensing.lux, diffraction=noise.sensing.diffraction).read_out_as(noise)
         noise = fresh if planes is not None else fresh.over_as_many_as(noise)
     if ppp is not None:
         noise = noise.but(ppp=ppp, lux=None)

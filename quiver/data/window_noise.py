@@ -25,8 +25,9 @@ from qsim.streams.exposures import Exposures
 from qsim.streams.preparation import followed
 from qsim.streams.simulation import Draw
 from quiver.data.code_table import draw_codes
-from quiver.data.defects import Filler, behind, of_draw, skips_codes
+from quiver.data.defects import behind, of_draw
 from quiver.data.illumination import Illumination, stored_defects
+from quiver.data.mosaic_windows import filled_windows
 
 NEGLIGIBLE = 1e-6  # chance of an afterpulse chain that is as long as the frames before a window
 
@@ -91,10 +92,14 @@ def behind_defects(noise: Illumination, draw: Draw, clip: Clip) -> tuple[Array |
     return bad, behind(bad, draw.defects, draw.sensor, shape, draw.origin)
 
 
-def window_filler(bad: Array | None, place: WindowPlace, side: int, sensor: Sensor) -> Filler | None:
-    """Return what fills the dead and hot pixels `bad` of a window [side, side], not turned; None without any."""
-    crop = None if bad is None else bad[place.y : place.y + side, place.x : place.x + side]
-    return None if crop is None or not crop.any() else Filler(crop, skips_codes(sensor))
+def filled_window(codes: Array, bad: Array | None, place: WindowPlace, sensor: Sensor, tile: tuple[int, int]) -> Array:
+    """Return the codes [T, side, side] of a window, not turned, with the dead and hot pixels `bad` of the clip filled.
+
+    They are filled from pixels at the same place of the tile of colour filters.
+    """
+    side = codes.shape[-1]
+    own = None if bad is None else bad[place.y : place.y + side, place.x : place.x + side]
+    return codes if own is None or not own.any() else filled_windows(codes, own, sensor, tile)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,8 @@ from torch.utils.data import Dataset, Sampler
 
 from qsim.dataset.clip_list import ClipList
 from qsim.keys import Key
+from qsim.sensor.colour_filter import ColourFilter
+from qsim.sensor.demosaicing import determines_bands
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
 from qsim.streams.code_truth import CodeTruth
@@ -38,13 +40,14 @@ from quiver.data.code_table import draw_codes
 from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.data.mixture import Mixture, choose
+from quiver.data.mosaic_windows import TURNS, fitting_turns, place_in_tile, turned_frame
 from quiver.data.window_noise import (
     WindowLight,
     WindowPlace,
     behind_defects,
     check_slices,
     check_windows,
-    window_filler,
+    filled_window,
 )
 from quiver.host import own_numbers
 
@@ -91,10 +94,10 @@ class Windows(Dataset[dict[str, Any]]):
     Numbers from `len` on are windows, too: those of the next epochs, with new noise. An item holds:
 
         codes    float32 [T, 1, h, w] in [0, 1]
-        target   float32 [T, 1, h, w], sharp photons / white, up to `ceiling` or the peak
+        target   float32 [T, 1, h, w], of mosaics [T, 3, h, w]: sharp photons / white, up to `ceiling` or the peak
         white    photons
         peak     photons, of its scores
-        ppp      mean photons per pixel and exposure
+        ppp      mean photons per pixel and exposure, of a mosaic those behind its filters
         sample   its number
         key      text: clip, place, light, random key
         still    float32 [T, 1, h, w] in [0, 1], codes of a scene that rests as in the centre frame, if asked for
@@ -102,8 +105,9 @@ class Windows(Dataset[dict[str, Any]]):
         ...      what `prepare` returns for the codes, their sensor, exposure and light
 
     Codes and target follow the sensor of their window. `noise` is the mixture that windows draw from; `repr` shows it.
-    `ValueError` for a folder without clips, for clips shorter or smaller than a window, and for noise that windows
-    cannot have.
+    Clips of three bands give mosaics: all noises have the same colour filters, whose mask begins at the first pixel of
+    each window (mosaic_windows.py). `ValueError` for a folder without clips, for clips shorter or smaller than a
+    window, and for noise that windows cannot have.
     """
 
     def __init__(
@@ -130,6 +134,7 @@ class Windows(Dataset[dict[str, Any]]):
             self.noise = choose(self.clips)
         else:
             self.noise = Mixture(tuple(light.stated() for light in settings.lights))
+        self.filters = _filters_of_all(alike, self.noise.noises, settings)
         for noise in self.noise.noises:
             _check_codes(alike, noise, settings)
         lit = {clip.camera is None: clip for clip in reversed(alike)}  # of clips that are alike the first
@@ -171,6 +176,9 @@ class Windows(Dataset[dict[str, Any]]):
         backwards = bool(rng.integers(2)) if settings.reverse else False
         timing = self.noise.noises[light].timing
         codes = len(timing.over(self.clip(clip)))
+        if timing.rows is not None:
+            turn = TURNS_OF_ROWS[timing.rows.axis][turn % 2]
+        turn, y, x = self._in_tile(clip, light, turn, y, x, drift)
         return WindowPlace(
             clip=clip,
             start=frame * (codes - settings.frames + 1) // (length - settings.frames + 1),
@@ -178,7 +186,7 @@ class Windows(Dataset[dict[str, Any]]):
             x=x,
             drift=drift,
             light=light,
-            turn=turn if timing.rows is None else TURNS_OF_ROWS[timing.rows.axis][turn % 2],
+            turn=turn,
             backwards=backwards and timing.rows is None,
             key=Key(seed=settings.seed, clip=n, stage=TRAINING),
         )
@@ -188,9 +196,32 @@ class Windows(Dataset[dict[str, Any]]):
         settings = self.settings
         if not settings.drift or rng.random() < 0.5:
             return 0, 0
-        room = [(side - settings.crop) // max(1, settings.frames - 1) for side in self.clip(clip).shape[1:]]
+        kept = (0, 0) if self.filters is None else [period - 1 for period in self.filters.tile]  # to place the mask
+        sides = self.clip(clip).shape[1:]
+        room = [
+            max(0, side - settings.crop - most) // max(1, settings.frames - 1)
+            for side, most in zip(sides, kept, strict=True)
+        ]
         dy, dx = (int(rng.integers(-most, most + 1)) for most in (min(settings.drift, r) for r in room))
-        return dy, dx
+        if self.filters is None:
+            return dy, dx
+        rows, columns = self.filters.tile  # by full tiles: the filters stay in place
+        return int(dy / rows) * rows, int(dx / columns) * columns
+
+    def _in_tile(
+        self, number: int, light: int, turn: int, y: int, x: int, drift: tuple[int, int] = (0, 0)
+    ) -> tuple[int, int, int]:
+        """Return a turn and a place of a window at which its mask begins; the same without colour filters."""
+        if self.filters is None:
+            return turn, y, x
+        clip = self.clip(number)
+        fitting = _turns_of_mosaic(self.filters, clip, self.noise.noises[light], self.settings)
+        turn = turn if turn in fitting else sorted(fitting)[turn % len(fitting)]
+        rows, columns = self.filters.tile
+        back = [max(0, -step * (self.settings.frames - 1)) for step in drift]
+        y = back[0] + place_in_tile(y - back[0], fitting[turn][0] - back[0], rows)
+        x = back[1] + place_in_tile(x - back[1], fitting[turn][1] - back[1], columns)
+        return turn, y, x
 
     def _middle(self, index: int) -> WindowPlace:
         settings = self.settings
@@ -201,7 +232,8 @@ class Windows(Dataset[dict[str, Any]]):
         y = (height - settings.crop) // 2
         x = (width - settings.crop) // 2
         key = Key(seed=settings.seed, clip=index, stage=VALIDATION)
-        return WindowPlace(clip, start, y, x, (0, 0), light, 0, False, key)
+        turn, y, x = self._in_tile(clip, light, 0, y, x)
+        return WindowPlace(clip, start, y, x, (0, 0), light, turn, False, key)
 
     def clip(self, number: int) -> Clip:
         """Return the opened clip of a number; those that were used last stay open."""
@@ -237,14 +269,13 @@ class Windows(Dataset[dict[str, Any]]):
         sharp = self._sharp(place, photons)
         scale = 1.0
         if settings.force_exposure and noise.ppp is not None:
-            scale = noise.ppp / max(float(photons.mean()), 1e-9)
+            scale = noise.ppp / max(float((photons if self.filters is None else sharp).mean()), 1e-9)
         try:
             if noise.defects is None and draw.timing == Timing():  # any pixel of the sensor, in its own random numbers
                 codes = draw_codes(draw.sensor, photons * scale, exposure, place.key)
             else:
-                drawn = light.drawn(scale)
-                filler = window_filler(bad, place, settings.crop, behind)
-                codes = self._turned(drawn if filler is None else filler.fill(drawn, 0), place)
+                tile = (1, 1) if self.filters is None else self.filters.tile
+                codes = self._turned(filled_window(light.drawn(scale), bad, place, behind, tile), place)
         except ValueError as error:
             raise ValueError(f"{clip.path}: window from code {place.start}: {error}") from None
         white = draw.sensor.white(exposure)
@@ -252,7 +283,7 @@ class Windows(Dataset[dict[str, Any]]):
         target = np.minimum(sharp / white, max(settings.ceiling, peak / white))  # a SPAD tells light above 2 white
         sample = {
             "codes": as_input(codes, draw.sensor),
-            "target": torch.from_numpy(target.astype(np.float32))[:, None],
+            "target": torch.from_numpy(target.astype(np.float32).reshape(len(codes), -1, *codes.shape[1:])),
             "white": white,
             "peak": peak,
             "ppp": float((photons * scale).mean()),
@@ -271,10 +302,13 @@ class Windows(Dataset[dict[str, Any]]):
         if self.prepare is None:
             return sample
         seen = array_codes(codes, behind, exposure, name=clip.name)
-        return sample | dict(self.prepare(replace(seen, ppp=level, shares=shares)))
+        return sample | dict(self.prepare(replace(seen, ppp=level, shares=shares, colour=self.filters)))
 
     def photons_of(self, place: WindowPlace) -> tuple[Array, Array]:
-        """Return the expected photons of the exposed and of the sharp window, float64 [T, h, w] each, turned."""
+        """Return the expected photons of the exposed and of the sharp window, float64 [T, h, w] each, turned.
+
+        Of a mosaic the first are those behind its filters, and the second have three bands: [T, 3, h, w].
+        """
         clip = self.clip(place.clip)
         draw, _, _ = self._draw(place)
         settings = self.settings
@@ -287,16 +321,19 @@ class Windows(Dataset[dict[str, Any]]):
         return turned(window, replace(place, backwards=False))
 
     def _sharp(self, place: WindowPlace, exposed: Array) -> Array:
-        """Return the sharp photons [T, h, w] of a window, turned; those that are exposed where a clip has no others."""
+        """Return the sharp photons [T, h, w] of a window, turned; those that are exposed where a clip has no others.
+
+        Of clips of three bands they are [T, 3, h, w].
+        """
         clip = self.clip(place.clip)
         draw, _, _ = self._draw(place)
-        if draw.timing == Timing() and not (has_sharp(clip) or draw.diffraction):
+        if self.filters is None and draw.timing == Timing() and not (has_sharp(clip) or draw.diffraction):
             return exposed
         truth = CodeTruth(clip, draw.timing, draw.level.factor)
         return turned(np.stack([self._sharp_code(truth, place, i) for i in range(self.settings.frames)]), place)
 
     def _sharp_code(self, truth: CodeTruth, place: WindowPlace, i: int) -> Array:
-        """Return the sharp photons [h, w] of code i of a window, not turned."""
+        """Return the sharp photons [h, w] or [3, h, w] of code i of a window, not turned."""
         dy, dx = place.drift
         side = self.settings.crop
         return truth.sharp(place.start + i, (place.y, place.x, side, side), moved=(dy * i, dx * i))
@@ -386,15 +423,55 @@ def keep_last(kept: dict[Any, Any], count: int) -> None:
 
 
 def turned(window: Array, place: WindowPlace) -> Array:
-    """Return a window [T, h, w] flipped, turned and reversed as its place states."""
-    window = window[:, :, ::-1] if place.turn >= 4 else window
-    window = np.rot90(window, place.turn % 4, axes=(1, 2))
+    """Return a window [T, ..., h, w] flipped, turned and reversed as its place states."""
+    window = turned_frame(window, place.turn)
     return np.ascontiguousarray(window[::-1] if place.backwards else window)
 
 
 def as_input(codes: Array, sensor: Sensor) -> torch.Tensor:
     """Return codes [T, H, W] as the input of networks: float32 [T, 1, H, W], codes / (2^b - 1)."""
     return torch.from_numpy(codes.astype(np.float32) / np.float32(sensor.levels - 1))[:, None]
+
+
+def _filters_of_all(
+    clips: Sequence[Clip], noises: Sequence[Illumination], settings: WindowSettings
+) -> ColourFilter | None:
+    """Return the colour filters of all noises, None without any.
+
+    `ValueError` if they differ, do not determine three bands, or leave no place for a window in a clip.
+    """
+    for clip in clips:
+        if clip.bands is not None and not all(noise.colour for noise in noises):
+            raise ValueError(
+                f"{clip.name}: has three bands, and the noise of its windows no colour filters; sense a stream with "
+                "colour=rggb, whose filters they take, or give sensor= with a file that has a table [colour]"
+            )
+    found = {noise.colour: noise for noise in noises}
+    if len(found) > 1:
+        masks = [" ".join(noise.filters.mask) if noise.filters else "none" for noise in found.values()]
+        raise ValueError(f"windows have one mask of colour filters, these noises {'; '.join(masks)}; choose one")
+    noise = noises[0]
+    filters = noise.filters
+    if filters is None:
+        return None
+    if settings.still:
+        raise ValueError("windows of mosaics have no copies at rest; train a network that needs none")
+    if not determines_bands(filters, noise.draw(clips[0]).sensor.efficiency):
+        raise ValueError(f"{noise.sensor}: the mask {' '.join(filters.mask)} does not determine three bands")
+    for clip in clips:
+        for noise in noises:
+            _turns_of_mosaic(filters, clip, noise, settings)
+    return filters
+
+
+def _turns_of_mosaic(
+    filters: ColourFilter, clip: Clip, noise: Illumination, settings: WindowSettings
+) -> dict[int, tuple[int, int]]:
+    """Return the turns that windows of a clip may have, with the place of the tile at which they begin."""
+    rows = noise.timing.rows
+    allowed = TURNS if rows is None else TURNS_OF_ROWS[rows.axis]
+    room = [size - settings.crop for size in clip.shape[1:]]
+    return fitting_turns(filters, filters.shifted(*clip.origin), settings.crop, room, allowed)
 
 
 def _check_codes(clips: Sequence[Clip], noise: Illumination, settings: WindowSettings) -> None:
@@ -413,7 +490,6 @@ def check_clips(clips: Sequence[Clip], settings: WindowSettings) -> None:
     if not clips:
         raise ValueError("no complete clip to draw windows from; check the split, or finish `qsim generate`")
     for clip in clips:
-        clip.require_one_band("training")
         length, height, width = clip.shape
         if length < settings.frames or min(height, width) < settings.crop:
             less = "choose fewer frames=" if length < settings.frames else "choose a smaller crop="

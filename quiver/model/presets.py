@@ -3,7 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from torch import nn
@@ -12,6 +12,7 @@ from torch.overrides import TorchFunctionMode
 from quiver.host import own_numbers
 from quiver.model import names
 from quiver.model.config import Config
+from quiver.model.mosaic_network import MosaicNet, MosaicNetConfig
 from quiver.model.quiver import QUIVER
 
 
@@ -86,7 +87,40 @@ def build(name: str) -> nn.Module:
 
 def made(config: Any) -> nn.Module:
     """Return the network of a configuration of any kind, with random weights."""
+    if isinstance(config, MosaicNetConfig):
+        return MosaicNet(config, made(configuration(config.core, dict(config.settings))))
     return next(network(config) for network, kind in NETWORKS.items() if kind is type(config))
+
+
+def configuration(kind: str, values: dict[str, object]) -> Any:
+    """Return the configuration of a class of networks from its values; `ValueError` for others."""
+    kinds: dict[str, Any] = {network.__name__: config for network, config in NETWORKS.items()}
+    if kind == MosaicNet.__name__:
+        found = MosaicNetConfig.from_dict(values)
+        if found.core not in kinds:  # of a core that is a MosaicNet, too, the depth would have no bound
+            _unknown(found.core)
+        return found
+    return kinds[kind].from_dict(values) if kind in kinds else _unknown(kind)
+
+
+def _unknown(kind: str) -> NoReturn:
+    raise ValueError(f"no network is called {kind[:60]!r}")
+
+
+def on_mosaics(network: nn.Module, mask: tuple[str, ...]) -> MosaicNet:
+    """Return a network of one band with a learned end for a mask; the end is untrained, and returns linear bands.
+
+    `ValueError` for one with an end for another mask.
+    """
+    if isinstance(network, MosaicNet):
+        if network.config.mask != mask:
+            raise ValueError(
+                f"these weights are for the mask {' '.join(network.config.mask)}, and the clips have {' '.join(mask)}; "
+                "start from weights of one band, or from none"
+            )
+        return network
+    config: Any = network.config
+    return MosaicNet(MosaicNetConfig(type(network).__name__, config.to_dict(), mask), network)
 
 
 class WithoutValues(TorchFunctionMode):

@@ -20,7 +20,7 @@ from qsim import limits, opening
 from qsim.files import write_bytes
 from qsim.thread_warnings import warnings_here
 from quiver.host import own_numbers
-from quiver.model.presets import NETWORKS, WithoutValues
+from quiver.model.presets import WithoutValues, configuration, made
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files
 MAX_REASON = 300  # characters of an error of torch that are shown
@@ -86,7 +86,7 @@ def load(path: Path) -> nn.Module:
             raise ValueError(f"a configuration of {len(metadata['config'])} characters")
         values = json.loads(metadata["config"])
         with torch.device("meta"), WithoutValues():
-            network = _build(metadata["network"], values)
+            network = made(configuration(metadata["network"], values))
         for name, value in network.state_dict().items():
             if name in tensors and tensors[name].dtype != value.dtype:
                 raise ValueError(f"{name} holds {tensors[name].dtype}, the network {value.dtype}")
@@ -132,14 +132,6 @@ def _in_bytes(tensors: dict[str, Tensor], metadata: dict[str, str]) -> bytes:
     header = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)  # tensors begin at a multiple of eight bytes
     return len(header).to_bytes(8, "little") + header + content[end:]
-
-
-def _build(kind: str, values: dict[str, object]) -> nn.Module:
-    """Return the network of a kind and the values of its configuration; `ValueError` for others."""
-    for network, config in NETWORKS.items():
-        if kind == network.__name__:
-            return network(config.from_dict(values))  # type: ignore[attr-defined]
-    raise ValueError(f"no network is called {kind[:60]!r}")
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -17,6 +17,7 @@ from quiver.data.codes import Codes, light_of
 from quiver.device import DEVICES, HOST_MEMORY, default_memory, pick_device
 from quiver.host import own_numbers
 from quiver.restoration.domain import UP_TO_A_FACTOR, Scope, place_of, remark
+from quiver.restoration.learned_bands import LearnedBands
 from quiver.restoration.mosaics import by_colour, fill_mosaic
 
 AUTO = "auto"  # chooses the method of a stream: see automatic.py
@@ -77,6 +78,7 @@ class Restorer:
     together: int = 1  # frames that are restored at a time and share most of the work
     scope: Scope | None = None  # of a network: the streams that it was measured for or trained on; None: not known
     device: str = "cpu"  # where it runs
+    bands: LearnedBands | None = None  # R, G and B of the light behind colour filters; None: the linear estimate
     seen: int | None = None  # most frames used for one, if the first and the last of `window` are never used together
 
     @property
@@ -97,10 +99,12 @@ class Restorer:
     @own_numbers
     def into(self, codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
         """Write what `restore` returns of frames `first` ... into `out`, zeros of that shape."""
+        if self.bands is not None:
+            self.bands.check(codes)
         if codes.colour is None:
             self.fill(codes, out, first, progress)
         else:
-            fill_mosaic(self.fill, codes, out, first, progress)
+            fill_mosaic(self.fill, codes, out, first, progress, self.bands or Codes.demosaiced)
 
 
 # ---- What is said of methods on a stream

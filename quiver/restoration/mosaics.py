@@ -77,8 +77,11 @@ def fill_mosaic(
     out: Array,
     first: int,
     progress: Progress | None,
+    joined: Callable[[Codes, Array], Array] = Codes.demosaiced,
 ) -> None:
     """Write the photons of R, G and B of frames `first` ... into out [t, 3, H, W]; `fill` restores one band.
+
+    `joined` makes bands [3, H, W] of the light [H, W] of a frame.
 
     `out` is zero. Its first band collects the light of all places: `out` may be a file, and memory hold few frames.
     """
@@ -88,7 +91,7 @@ def fill_mosaic(
     for n, ((i, j), place) in enumerate(places(codes)):
         fill(place, light[:, i::rows, j::columns], first, _share(progress, n, rows * columns, len(out)))
     for t in range(len(out)):
-        out[t] = codes.demosaiced(light[t].copy())
+        out[t] = joined(codes, light[t].copy())
 
 
 def _share(progress: Progress | None, n: int, places: int, frames: int) -> Progress | None:

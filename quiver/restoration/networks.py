@@ -19,6 +19,7 @@ from quiver.data.codes import Codes, frame_reader, light_of
 from quiver.data.noise_table import noise_table
 from quiver.device import moved, pick_device
 from quiver.restoration.interface import RestoreOptions, Restorer
+from quiver.restoration.learned_bands import LearnedBands
 from quiver.restoration.pieces import Disagreement, cut_pieces, part_of, takes_clips, told_of_cut
 
 if TYPE_CHECKING:
@@ -47,9 +48,12 @@ def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
 
 def network_title(model: nn.Module) -> str:
     """Return a title for people: `QUIVER (quiver-s)`, `U-Net`, `EMVD (emvd)`."""
+    from quiver.model.mosaic_network import MosaicNet
     from quiver.model.presets import PRESETS
     from quiver.model.unet import UNet
 
+    if isinstance(model, MosaicNet):
+        return f"{network_title(model.core)} on mosaics of {' '.join(model.config.mask)}"
     if isinstance(model, UNet):
         return "U-Net"
     preset = next((name for name, config in PRESETS.items() if config == model.config), None)
@@ -62,9 +66,15 @@ def wrap_network(
     """Return a network as a method; the checksum is that of its weights."""
     from quiver.model.blocks import RADIUS, WINDOW
     from quiver.model.mergenet import MergeNet
+    from quiver.model.mosaic_network import MosaicNet
     from quiver.model.quiver import QUIVER
     from quiver.model.schedules import REACH
     from quiver.restoration.merging import fill_merged
+
+    if isinstance(model, MosaicNet):
+        core = wrap_network(model.core, name, description, options, weights_sha256)
+        model.to(core.device).eval()
+        return replace(core, bands=LearnedBands(name, model))
 
     mode = options.mode if isinstance(model, QUIVER) else None  # other networks have one way to share work
     description = description if mode is None else f"{description}, {mode}"

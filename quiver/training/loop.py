@@ -35,6 +35,8 @@ from quiver.data.windows import Batches, Windows, WindowSettings
 from quiver.device import is_gpu, moved
 from quiver.evaluation import metrics
 from quiver.host import flushed_denormals
+from quiver.model.mosaic_network import MosaicNet
+from quiver.model.presets import on_mosaics
 from quiver.training.optimiser import Optimiser
 from quiver.training.processes import Process, begin_worker, joined, plain_errors
 from quiver.training.run_folder import Run
@@ -145,14 +147,15 @@ def validate(
     for i in range(len(windows)):
         sample = windows[i]
         restored, first = system.restored(model, on_device(default_collate([sample]), device))
-        output = restored[0, :, 0].float().cpu()
-        target = sample["target"][first : first + len(output), 0]
+        output = restored[0].float().cpu().squeeze(1)  # bands of one frame are scored together
+        target = sample["target"][first : first + len(output)].squeeze(1)
         if not bool(torch.isfinite(output).all()):
             output = torch.zeros_like(output)  # scored as black; the next training step reports the cause
         unit = float(sample["white"]) / float(sample["peak"])  # scores have one peak for every sensor
         scores.append(metrics.score(output.numpy() * unit, target.numpy() * unit))
         if i == 0:
-            picture = torch.cat([sample["codes"][first, 0], output[0], target[0]], dim=1).clamp(0, 1)
+            shown = [frame.reshape(-1, *frame.shape[-2:]).mean(0) for frame in (output[0], target[0])]
+            picture = torch.cat([sample["codes"][first, 0], *shown], dim=1).clamp(0, 1)
     model.train()
     finite = [score for score in scores if math.isfinite(score.psnr_matched)]
     return metrics.mean_score(finite or scores), picture
@@ -295,6 +298,19 @@ class Trainer:
             self.stored = True
 
 
+def for_bands(model: nn.Module, settings: Settings) -> nn.Module:
+    """Return the network with a learned end for the mask of the noise's colour filters; the same without filters.
+
+    `ValueError` for a network with such an end where the noise has no filters.
+    """
+    filters = settings.lights[0].filters
+    if filters is not None:
+        return on_mosaics(model, filters.mask)
+    if isinstance(model, MosaicNet):
+        raise ValueError("start: these weights restore mosaics, and the clips have one band; start from others")
+    return model
+
+
 def train(
     model: nn.Module,
     settings: Settings,
@@ -307,6 +323,7 @@ def train(
 ) -> State:
     """Train `model` in place to the end that the settings define, or until `should_stop`; return its state.
 
+    On clips of three bands it becomes the core of a `MosaicNet`, which is what the run stores.
     A run in `settings.out` is resumed; `force` starts it again from the beginning. `note` receives lines about the
     noise of the windows, missing clips, and the step from which the run goes. ValueError and OSError for settings and
     folders that do not fit, `Diverged` for NaN or Inf. During the call torch has the number of threads that the
@@ -317,18 +334,22 @@ def train(
         stack.callback(torch.set_num_threads, torch.get_num_threads())
         asked = settings.threads
         system = system_of(model)
-        system.refuse(model, settings)
-        validated = system.validated(model, settings)
         windows: AnyWindows
         fixed: Subset[dict[str, Any]] | None = None
         if system.of_stream:
+            system.refuse(model, settings)
             windows = make_stream_windows(settings)
+            validated = system.validated(model, settings)
             lines = ["noise: that of the stream"]
             earlier = None if force else threads.recorded(Path(settings.out) / "settings.json")
             settings = replace(settings, threads=threads.use(asked, earlier).number)
         else:
             settings, lines = settled(settings, force=force)
             settings = replace(settings, threads=threads.use(asked, settings.threads).number)
+            model = for_bands(model, settings)
+            system = system_of(model)
+            system.refuse(model, settings)
+            validated = system.validated(model, settings)
             windows, fixed = make_windows(settings, system.side(model), system, validated, system.window(model))
             lines += unfinished(settings.folders)
         conditions = {"processes": process.world, "computes_in": precision_of(settings, process.device)}

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from quiver.model.blocks import RADIUS, Output
 from quiver.model.mergenet import MergeNet
+from quiver.model.mosaic_network import MosaicNet
 from quiver.model.presets import build
 from quiver.model.rivals.bit2bit import Bit2Bit
 from quiver.model.rivals.emvd import EMVD
@@ -24,6 +25,7 @@ from quiver.training import merge_training as merging
 from quiver.training import rival_losses as rivals
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.loss import training_loss
+from quiver.training.mosaic_training import mosaic_system
 from quiver.training.self_supervised import split_loss
 from quiver.training.settings import PROTOCOLS, Settings
 from quiver.training.system import Batch, System
@@ -173,6 +175,8 @@ SYSTEMS: dict[type[nn.Module], System] = {
 
 def system_of(network: nn.Module) -> System:
     """Return how a network is trained; networks with the outside of QUIVER are trained alike."""
+    if isinstance(network, MosaicNet):
+        return mosaic_system(system_of(network.core), network)
     return SYSTEMS.get(type(network), OURS)
 
 

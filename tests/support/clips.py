@@ -13,6 +13,7 @@ from numpy import ndarray as Array
 from qsim import descriptions
 from qsim.clip.clip_info import PHYSICAL, RELATIVE
 from qsim.clip.writer import ClipWriter
+from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import Options, generate
 from qsim.dataset.job import Job
 from qsim.dataset.recipe import Recipe
@@ -77,8 +78,21 @@ def describe_video(path: Path, **about: Any) -> None:
 
 def colour_clip(path: Path, frames: int = 3, height: int = 7, width: int = 9, **meta: object) -> Clip:
     """A clip of three bands whose patterns differ, of odd size unless others are given."""
-    bands = [sliding_pattern(frames, height, width, seed) * light for seed, light in ((1, 0.6), (2, 1.0), (3, 1.7))]
-    return write_clip(path, radiance=np.stack(bands, axis=1), bands=list(RGB), **meta)
+    return write_clip(path, radiance=colour_pattern(frames, height, width), bands=list(RGB), **meta)
+
+
+def colour_pattern(frames: int, height: int, width: int) -> Array:
+    """Radiance [T, 3, H, W] of patterns that differ from band to band."""
+    lit = ((1, 0.6), (2, 1.0), (3, 1.7))
+    return np.stack([sliding_pattern(frames, height, width, seed) * light for seed, light in lit], axis=1)
+
+
+def colour_dataset(path: Path, splits: dict[str, int], sensor: Any, **sensing: Any) -> Path:
+    """A data set of three bands, each clip with a stream."""
+    write_dataset(path, splits, radiance=colour_pattern(14, 36, 44), bands=list(RGB))
+    for clip in Dataset.open(path).clips():
+        clip.sense(sensor, **sensing)
+    return path
 
 
 def write_dataset(path: Path, splits: dict[str, int], **options: object) -> Path:

@@ -14,6 +14,7 @@ import torch
 from clips import ClipMaker
 from sensor_files import QIS, sensor_file
 
+from qsim.sensor.colour_filter import MASKS
 from qsim.settings import settings_of
 from qsim.streams.exposures import Timing
 from qsim.streams.preparation import prepare
@@ -58,10 +59,20 @@ def test_lights_of_one_label_get_names_that_tell_them_apart():
     assert labels(()) == {}
 
 
-def test_a_sensor_file_with_colour_filters_is_refused(tmp_path):
-    """Training windows have one band, and their sensor is recorded without filters."""
-    file = sensor_file(tmp_path, QIS.removesuffix("[defects]\n") + '[colour]\nmask = "rggb"\n', 3)
-    with pytest.raises(ValueError, match=r"mine\.toml: training windows have one band; leave its table \[colour\] out"):
+def test_the_filters_of_a_sensor_file_are_recorded(tmp_path):
+    """A run does not depend on the file; filters that follow qe_curve are known with a clip only, and refused."""
+    text = QIS.removesuffix("[defects]\n")
+    file = sensor_file(tmp_path, text + '[colour]\nmask = "rggb"\nefficiency.R = 0.5\n', 3)
+    with pytest.raises(ValueError, match=r"efficiency: colour G of the mask has none"):
+        Illumination.of(file, 3.0, 3).stated()
+    file = sensor_file(tmp_path, text + '[colour]\nmask = "quad"\n', 3)
+    stated = Illumination.of(file, 3.0, 3).stated()
+    assert stated.filters.mask == MASKS["quad"]
+    assert Illumination.from_dict(json.loads(json.dumps(stated.to_dict()))) == stated
+    assert stated.label == "3 PPP, 3 bit, mask RRGG RRGG GGBB GGBB"
+    file = sensor_file(tmp_path, text.replace("quantum_efficiency = 0.8", "qe_curve = [[4e-7, 0.3], [7e-7, 0.8]]"), 3)
+    Path(file).write_text(Path(file).read_text() + '[colour]\nmask = "rggb"\n')
+    with pytest.raises(ValueError, match="its filters follow qe_curve"):
         Illumination.of(file, 3.0, 3).stated()
 
 
@@ -109,7 +120,7 @@ def test_settings_act_in_windows_as_in_sensing(make_clip: ClipMaker, tmp_path, s
 
 def test_every_other_setting_is_refused(make_clip: ClipMaker):
     """A setting that is new is refused until windows honour it."""
-    others = {"seed": 3, "planes": 7, "name": "x", "colour": "rggb", "follow": True}
+    others = {"seed": 3, "planes": 7, "name": "x", "follow": True}
     assert {setting.name for setting in settings_of(Sensing)} == {*others, *HONOURED}
     clip = make_clip()
     for name, value in others.items():
@@ -118,7 +129,7 @@ def test_every_other_setting_is_refused(make_clip: ClipMaker):
             Windows([clip], WindowSettings((light,), crop=16))
     settings = {"seed": 3, "diffraction": True, "colour": "rggb", "later": 1}
     info = SimpleNamespace(planes_per_code=3, settings=settings, sensing=Sensing("spad512s"), bits=3)
-    unlike = ["colour", "later", "codes of 3 clip frames that its settings do not state"]
+    unlike = ["later", "codes of 3 clip frames that its settings do not state"]
     assert unlike_windows(SimpleNamespace(info=info, timing=Timing(3, summed=True))) == unlike
 
 
