@@ -14,6 +14,7 @@ from qsim.cli.console import MAKES_AGAIN, PILOT, RESUMES, bar, note, output, ref
 from qsim.cli.options import check_free
 from qsim.files import Progress
 from qsim.kinds import Bits, Frames, NotNegative, Number, Positive, Seed, Whole
+from qsim.sensor.colour_filter import MASKS
 from qsim.settings import setting
 from qsim.time_forecast import TimeForecast
 from qsim.words import frame_size, steps
@@ -77,6 +78,9 @@ class Tradeoff:
     temperature: Annotated[
         Number | None, setting("degrees C of sensor files with dark_doubling", unset="the file's own")
     ] = None
+    colour: Annotated[
+        str | None, setting("what pixels of a colour clip see: the mask of its filters", choices=tuple(MASKS))
+    ] = None
     instants: Annotated[Whole | None, setting("frames drawn and scored per depth", unset="8")] = None
     frames: Annotated[Frames | None, setting("frames of a rendered scene", unset="enough for the instants")] = None
     seed: Annotated[Seed | None, setting("seed of the noise and of a rendered scene", unset="0")] = None
@@ -107,7 +111,10 @@ class Tradeoff:
         return self.output
 
 
-OF_STUDIES = ("px", "ppp", "bits", "base_fps", "sensor", "plane_sensor", "temperature", "instants", "frames", "streams")
+OF_STUDIES = (
+    *("px", "ppp", "bits", "base_fps", "sensor", "plane_sensor", "temperature", "colour", "instants", "frames"),
+    "streams",
+)
 PICTURES = {"tradeoff": ("best.png", "tradeoff.png")}  # of a study: which of them depends on its size
 OF_FILES = ("seed", "speed", "output", "force")
 _OF_TABLE = (
@@ -192,8 +199,16 @@ def _tradeoff_study(asked: Tradeoff) -> int:
     instants = 8 if asked.instants is None else asked.instants
     sensor = asked.sensor or "quiver-physical"
     settings = StudySettings(
-        bits, sensor, asked.plane_sensor, None, 1, instants, asked.draws, bool(asked.px), asked.temperature
+        bits,
+        sensor,
+        asked.plane_sensor,
+        instants=instants,
+        seed=asked.draws,
+        moving=bool(asked.px),
+        temperature=asked.temperature,
+        colour=asked.colour,
     )
+    _check_colour(asked)
     study_clips.check_sensors(settings, asked.streams)  # before anything is rendered
     height, width = asked.size or (96, 128)
     widen = asked.bits is None
@@ -237,6 +252,16 @@ def _tradeoff_study(asked: Tradeoff) -> int:
         text += _write_study(asked.folder, "tradeoff.json", result, done.pictures)
     output(result, text + done.answers)
     return 0
+
+
+def _check_colour(asked: Tradeoff) -> None:
+    """Raise `ValueError` for a mask where no colour clip is studied."""
+    if asked.colour is None:
+        return
+    if not asked.of_clip:
+        raise ValueError("--colour: is of a colour clip; render the scene with `qsim render --bands rgb`, and name it")
+    if asked.streams:
+        raise ValueError("--streams: writes streams of one band; leave it out with --colour")
 
 
 @dataclass

@@ -2,10 +2,11 @@
 
     OUT.h5 / SPLIT (train, val, test; all for a clip) /
         codes   uint8 or, above 8 bits, uint16 [N, T, H, W]
-        truth   float32 [N, T, H, W], sharp expected photons per pixel and code
+        truth   float32 [N, T, H, W], in colour [N, T, 3, H, W]: sharp expected photons per pixel and code
         flow    float32 [N, T, 2, H, W], px from a code to the next (u right, v down); NaN where it is not known
         first, bits, ppp, exposure, frame_rate   [N]: frame of the stream, its bits, light, seconds and rate of a code
         clip, stream, sensor, code_model         [N]: names, sensor as JSON, how a code is made of its planes
+        colour                                   [N]: colour filters from the first pixel on, as JSON; colour clips only
 
 A window is T successive codes of a stream; windows do not overlap. One chunk holds one window.
 """
@@ -48,7 +49,7 @@ class Window:
         return self.stream.codes(self.first, self.first + self.frames)
 
     def truth(self) -> Array:
-        """Return the sharp photons, float32 [T, H, W]."""
+        """Return the sharp photons, float32 [T, H, W] or [T, 3, H, W]."""
         return self.stream.truth(self.first, self.first + self.frames).astype(np.float32)
 
     def flow(self) -> Array:
@@ -71,6 +72,8 @@ class Window:
         rates = {"exposure": self.stream.exposure, "frame_rate": info.frame_rate}
         names = {"clip": self.clip.name, "stream": self.stream.name, "sensor": sensor}
         names |= {"code_model": info.code_model}
+        if info.colour is not None:
+            names["colour"] = json.dumps(info.colour.to_dict())
         return {"first": self.first} | light | rates | names
 
 
@@ -82,7 +85,7 @@ def streams_of(clips: Iterable[Clip]) -> list[Sensed]:
 def windows(
     splits: Mapping[str, Sequence[Sensed]], frames: int, sums: PlaneSums = AS_STORED
 ) -> dict[str, list[Window]]:
-    """Return the windows of all streams, by split; `ValueError` for none, and for clips of unequal sizes.
+    """Return the windows of all streams, by split; `ValueError` for none, and for clips of unequal sizes or bands.
 
     Streams of planes are summed as asked, from the first plane on: their truth is that of codes that follow each other.
     """
@@ -92,7 +95,6 @@ def windows(
     found: dict[str, list[Window]] = {}
     for split, sensed in splits.items():
         for clip, stored in sensed:
-            clip.require_one_band("a file of pairs")
             if stored.shares is not None:
                 raise ValueError(
                     f"{stored.path}: its codes have different exposures, those of a window have one; use another stream"
@@ -112,6 +114,9 @@ def windows(
         raise ValueError(
             f"clips {a} and {b} are {one[0]} x {one[1]} and {two[0]} x {two[1]} px; convert them one by one"
         )
+    coloured = {window.clip.bands is not None: window.clip.name for window in every}
+    if len(coloured) > 1:
+        raise ValueError(f"clip {coloured[True]} has three bands and {coloured[False]} one; convert them one by one")
     return found
 
 
@@ -151,9 +156,10 @@ def _fill(group: Any, listed: Sequence[Window]) -> Iterator[None]:
 
     height, width = listed[0].clip.shape[1:]
     shape = (listed[0].frames, height, width)
+    bands = () if listed[0].clip.bands is None else (3,)
     kinds = {
         "codes": (np.uint16 if any(window.stream.bits > 8 for window in listed) else np.uint8, shape),
-        "truth": (np.float32, shape),
+        "truth": (np.float32, (shape[0], *bands, height, width)),
         "flow": (np.float32, (shape[0], 2, height, width)),
     }
     arrays = {

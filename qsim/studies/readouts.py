@@ -64,10 +64,9 @@ class Readouts:
 def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) -> Readouts:
     """Return the comparison of streams and events (by default all) over `span` [s], by default the longest code.
 
-    Instants end with the stream that ends first. `ValueError` for a clip of three bands or without streams, and for a
-    span below a clip frame or above what all streams cover.
+    Instants end with the stream that ends first. Of a colour clip every pixel is scored in the light behind its filter.
+    `ValueError` for a clip without streams, and for a span below a clip frame or above what all streams cover.
     """
-    clip.require_one_band("a comparison of readouts")
     streams, events = _named(clip, names)
     if not streams and not events:
         raise ValueError(f"{clip.path}: has no streams to compare; make some with `qsim sense` or `qsim events`")
@@ -88,8 +87,8 @@ def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) ->
     centres = tuple(range(window // 2, end - window + window // 2 + 1, window))
     peak = WHITE_PER_MEAN * float(np.mean([clip_photons(clip, t).mean() for t in range(len(clip))]))
 
-    def score(found: Array, middles: Sequence[int]) -> float:
-        truth = np.stack([clip_photons(clip, t, sharp=True) for t in middles])
+    def score(found: Array, middles: Sequence[int], stream: Stream | None = None) -> float:
+        truth = np.stack([_seen(clip_photons(clip, t, sharp=True), stream) for t in middles])
         return psnr(peak, rms(found - truth))
 
     blurred = np.stack([_light(clip, t - window // 2, window) for t in centres])
@@ -104,7 +103,7 @@ def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) ->
         firsts = [_first_code(stream, t, codes) for t in centres]
         found = np.stack([_estimate(stream, response, first, codes) for first in firsts])
         middles = [first * per_code + codes * per_code // 2 for first in firsts]
-        rows.append(_row(stream, codes, codes * per_code * frame, score(found, middles)))
+        rows.append(_row(stream, codes, codes * per_code * frame, score(found, middles, stream)))
     for each in events:
         found = np.stack(list(_from_events(clip, each, centres)))
         rows.append(_event_row(clip, each, window, score(found, centres)))
@@ -157,12 +156,21 @@ def _event_row(clip: Clip, stream: EventStream, window: int, psnr_db: float) -> 
     )
 
 
+def _seen(photons: Array, stream: Stream | None) -> Array:
+    """Return photons [H, W] behind the colour filters of a stream; without filters or stream they are unchanged."""
+    filters = None if stream is None else stream.colour_filter
+    if filters is None:
+        return photons
+    assert stream is not None
+    return filters.mosaic(photons, stream.sensor.efficiency)
+
+
 def _frames_per_code(stream: Stream) -> int:
     return stream.info.planes_per_code
 
 
 def _light(clip: Clip, first: int, window: int) -> Array:
-    """Return the mean photons [H, W] of clip frames first ... first + window - 1."""
+    """Return the mean photons [H, W] or [3, H, W] of clip frames first ... first + window - 1."""
     return np.mean([clip_photons(clip, t) for t in range(first, first + window)], axis=0)
 
 

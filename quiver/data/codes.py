@@ -29,7 +29,7 @@ from qsim.keys import Key, hash_name
 from qsim.plane_sums import PlaneSums, Sums
 from qsim.restored_video import describes_restored
 from qsim.sensor.colour_filter import ColourFilter
-from qsim.sensor.demosaicing import demosaic, determines_bands
+from qsim.sensor.demosaicing import demosaic, determines_bands, kernels_of
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
 from qsim.streams.code_truth import CodeTruth
@@ -120,6 +120,12 @@ class Codes:
     def bands_determined(self) -> bool:
         """Return whether the colours of the stream's filters determine R, G and B; one filter does not."""
         return self.colour is None or determines_bands(self.colour, self.sensor.efficiency)
+
+    @property
+    def demosaicing_filters(self) -> Array:
+        """Return the linear filters behind `demosaiced`, float64 [rows, columns, 3, n, n], by place of the tile."""
+        assert self.colour is not None
+        return kernels_of(self.colour, self.sensor.efficiency)
 
     def demosaiced(self, light: Array) -> Array:
         """Return the photons of R, G and B [3, H, W] of the light [H, W] behind the stream's colour filters.

@@ -15,8 +15,11 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.sensor.colour_filter import ColourFilter
+from qsim.sensor.demosaicing import within
 from qsim.sensor.sensor import Sensor
 from quiver.data.defects import Filler, skips_codes
+
+__all__ = ["TURNS", "filled_windows", "fitting_turns", "place_in_tile", "places_of_turns", "turned_frame", "within"]
 
 TURNS = range(8)  # quarter turns 0..3, + 4 = mirrored first
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.sensor.demosaicing import within
 from quiver.data.codes import Codes
+from quiver.data.mosaic_windows import within
 
 if TYPE_CHECKING:
     from quiver.model.mosaic_network import MosaicNet

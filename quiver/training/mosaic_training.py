@@ -18,8 +18,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from qsim.sensor.demosaicing import kernels_of, within
 from quiver.data.codes import Codes
+from quiver.data.mosaic_windows import within
 from quiver.data.windows import Prepare
 from quiver.model.mosaic_network import MosaicNet
 from quiver.restoration.mosaics import places
@@ -58,8 +58,7 @@ def _check(core: System, network: Any, settings: Settings) -> None:
 
 def prepare(of_place: Prepare | None, codes: Codes) -> dict[str, Tensor]:
     """Return the linear estimate's filters, and the inputs that the core needs of every place, stacked."""
-    assert codes.colour is not None
-    found = {KERNELS: torch.from_numpy(kernels_of(codes.colour, codes.sensor.efficiency).astype(np.float32))}
+    found = {KERNELS: torch.from_numpy(codes.demosaicing_filters.astype(np.float32))}
     if of_place is None:
         return found
     each = [of_place(place) for _, place in places(codes)]

@@ -29,8 +29,9 @@ from qsim.colour import psnr
 from qsim.optics import radiometry
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
-from qsim.streams.photons import clip_photons, light_level
+from qsim.streams.photons import light_level
 from qsim.studies.bit_depth.laws import Structure
+from qsim.studies.bit_depth.pixel_light import check_bands, pixel_light
 from qsim.studies.bit_depth.readout import GRID, Readout, StudySettings, readouts
 
 
@@ -99,7 +100,7 @@ class Exposed:
 
 def check_clip(clip: Clip, settings: StudySettings) -> None:
     """Raise `ValueError` if the clip is too slow or too short for the settings."""
-    clip.require_one_band("a study of bit depth")
+    check_bands(clip, settings.colour)
     if clip.frame_rate < SLOWEST:
         raise ValueError(
             f"{clip.path}: {clip.frame_rate:g} fps; this study needs a clip of at least {SLOWEST:g} fps, as in "
@@ -132,12 +133,12 @@ def expose(
     """
     key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
     wanted = [2**b - 1 for b in settings.bits]
-    photons = clip_photons(clip, centre, factor)
+    photons = pixel_light(clip, centre, factor, settings.colour)
     total, fired, quiet, spread = (np.zeros_like(photons) for _ in range(4))
     before = photons
     for reach in range(wanted[-1] // 2 + 1):
         places = [centre] if reach == 0 else [centre - reach * settings.speed, centre + reach * settings.speed]
-        pair = [photons] if reach == 0 else [clip_photons(clip, t, factor) for t in places]
+        pair = [photons] if reach == 0 else [pixel_light(clip, t, factor, settings.colour) for t in places]
         for t, light in zip(places, pair, strict=True):
             p = plane.pmf(light, clip.exposure)
             fired += plane.sample(light, clip.exposure, key=key.at(t), origin=clip.origin)
@@ -219,7 +220,7 @@ def study(clip: Clip, settings: StudySettings, *, progress: Callable[[int, int],
     for done, centre in enumerate(centres):
         scored = scored_pixels(clip, centre, settings)
         pixels += int(scored.sum())
-        sharp = clip_photons(clip, centre, level.factor, sharp=True)
+        sharp = pixel_light(clip, centre, level.factor, settings.colour, sharp=True)
         for frame in expose(clip, centre, settings, level.factor, forms[0].sensor, structure, scored):
             for form in by_planes[frame.planes]:
                 codes = (

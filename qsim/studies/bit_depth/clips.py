@@ -156,6 +156,7 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings, *, force: b
     `quiver evaluate FOLDER/NAME_3bit --stream planes` scores a restorer against the sharp instants.
     """
     check_clip(clip, settings)
+    clip.require_one_band("a stream of summed light")
     level = light_level(clip, ppp=settings.ppp)
     plane = _summed_plane(settings, level.ppp, clip.exposure)
     made = []

@@ -35,6 +35,7 @@ class StudySettings:
     seed: int = 0
     moving: bool = False  # score the pixels that move at the scored instant, not the whole frame
     temperature: float | None = None  # degrees C of sensor files with dark_doubling; None: that of the file
+    colour: str | None = None  # mask over the pixels of a colour clip, a name of qsim.sensor.colour_filter.MASKS
 
     def __post_init__(self) -> None:
         if not self.bits or not all(1 <= b <= 10 for b in self.bits):

@@ -14,10 +14,10 @@ from qsim.clip.clamped_error import rms
 from qsim.colour import psnr
 from qsim.files import Progress
 from qsim.streams.clip import Clip
-from qsim.streams.photons import clip_photons
 from qsim.studies.bit_depth.answer import answer, at_edge, code_motion, widened
 from qsim.studies.bit_depth.clip_study import Study, StudyRow, check_clip, scored_pixels, study
 from qsim.studies.bit_depth.clips import MovingClip
+from qsim.studies.bit_depth.pixel_light import pixel_light
 from qsim.studies.bit_depth.readout import MODELS, StudySettings, readouts
 from qsim.tables import text_table
 
@@ -152,7 +152,7 @@ def law(base: Study, clip: Clip, settings: StudySettings, model: str, speed: flo
 
     `speed` is relative to that study. The noise is that of light that is constant during a frame.
     """
-    frames = {t: clip_photons(clip, t, 1.0, sharp=True) for t in base.instants}
+    frames = {t: pixel_light(clip, t, 1.0, settings.colour, sharp=True) for t in base.instants}
     whole = float(np.mean([frame.mean() for frame in frames.values()]))
     seen = replace(settings, speed=base.speed)
     light = np.concatenate([frame[scored_pixels(clip, t, seen)] for t, frame in frames.items()])

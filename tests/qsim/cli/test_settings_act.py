@@ -317,6 +317,7 @@ COMMANDS = Commands(
         "generate.cluster": "no cluster is there",
         "generate.gpus": "no cluster is there",
         "tradeoff.paper_figure": "needs a clip of 511 frames; tests/qsim/cli/test_tradeoff.py",
+        "tradeoff.colour": "needs a fast clip of three bands; tests/qsim/studies/bit_depth/test_clip_study.py",
         "generate.threads": "its workers render",
         **{
             f"validate.{name}": "a measurement of minutes; tests/qsim/studies/validation"

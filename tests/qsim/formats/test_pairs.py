@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clips import square_clip, write_clip, write_dataset
+from clips import colour_clip, square_clip, write_clip, write_dataset
 
 from qsim.cli.program import main
 from qsim.dataset.dataset import Dataset
+from qsim.formats.pairs import streams_of, windows
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.streams.clip import Clip
@@ -43,6 +44,24 @@ def test_a_data_set_becomes_windows_by_split(tmp_path: Path, capsys: pytest.Capt
                 assert rates == (stream.exposure, 2000.0, stream.sensor.code_model)
                 seen.add((clip.name, stream.name, int(first)))
     assert len(seen) == 12
+
+
+def test_windows_of_colour_clips_have_mosaics_and_three_bands(tmp_path: Path):
+    """Truth is that of the bands, and the filters are stated from the first pixel on; bands do not mix in a file."""
+    clip = colour_clip(tmp_path / "c", frames=6, origin=[1, 0])
+    stream = clip.sense(QIS(0.8, 1.6, 0.2, 3), ppp=6.0, colour="rggb", name="s")
+    assert main(["convert", str(clip.path), str(tmp_path / "p.h5"), "--to", "pairs", "--window", "3", "-q"]) == 0
+    with h5py.File(tmp_path / "p.h5", "r") as file:
+        group = file["all"]
+        assert group["codes"].shape == (2, 3, 7, 9)
+        assert group["truth"].shape == (2, 3, 3, 7, 9)
+        np.testing.assert_array_equal(group["codes"][1], stream[3:6])
+        np.testing.assert_allclose(group["truth"][1], stream.truth(3, 6), rtol=1e-6)
+        assert [json.loads(text)["mask"] for text in group["colour"].asstr()] == [["GB", "RG"]] * 2
+    grey = write_clip(tmp_path / "g", frames=6, height=7, width=9)
+    grey.sense(QIS(0.8, 1.6, 0.2, 3), ppp=6.0, name="s")
+    with pytest.raises(ValueError, match="clip c has three bands and g one; convert them one by one"):
+        windows({"all": streams_of([clip, grey])}, 3)
 
 
 def test_flow_is_that_of_the_clip_and_unknown_where_points_hide(tmp_path: Path):

@@ -4,14 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from clips import sliding_pattern, write_clip
 from stats import critical_z
 from waves import wave_clip
 
 from qsim.cli.program import main
 from qsim.clip.clip_info import RELATIVE
 from qsim.clip.writer import ClipWriter
+from qsim.optics.radiometry import RGB
 from qsim.report import clip_section
 from qsim.streams.clip import Clip
+from qsim.streams.photons import clip_photons, light_level
 from qsim.studies.bit_depth import answer, clip_study
 from qsim.studies.bit_depth.clip_study import study
 from qsim.studies.bit_depth.readout import MODELS, StudySettings, plane_sensor
@@ -36,6 +39,28 @@ def test_simulation_agrees_with_its_expectation(clip, ppp, plane):
     for row in rows:
         relative = row.psnr_error_db * np.log(10) / 10
         assert abs(row.sigmas) * relative < limit * relative + 3e-3, row
+
+
+def test_a_colour_clip_is_studied_behind_its_filters(tmp_path):
+    """Simulated errors keep their expectations, and a mask of one colour finds what a clip of that band alone has."""
+    light = sliding_pattern(15, 40, 48, 0)[:, None] * np.array([0.5, 1.0, 1.5])[:, None, None]
+    fast = {"frame_rate": 20_000.0, "exposure": 5e-5}
+    clip = write_clip(tmp_path / "c", radiance=light, bands=list(RGB), **fast)
+    settings = StudySettings(bits=(1, 3), ppp=2.0, instants=2)
+    rows = study(clip, replace(settings, colour="rggb")).rows
+    for row in rows:
+        relative = row.psnr_error_db * np.log(10) / 10
+        assert abs(row.sigmas) * relative < critical_z(1e-6 / len(rows)) * relative + 3e-3, row
+    grey = write_clip(tmp_path / "g" / "c", radiance=light[:, 1], **fast)
+    photons = [clip_photons(each, 7, light_level(each, ppp=2.0).factor).mean(axis=(-2, -1)) for each in (clip, grey)]
+    alike = study(grey, replace(settings, ppp=2.0 * float(photons[0][1] / photons[1])))
+    seen = study(clip, replace(settings, colour="green"))
+    for one, other in zip(seen.rows, alike.rows, strict=True):
+        assert (one.blur_error, one.shot_error) == pytest.approx((other.blur_error, other.shot_error), rel=1e-5)
+    with pytest.raises(ValueError, match="holds three bands; say what its pixels see, as in colour=rggb"):
+        study(clip, settings)
+    with pytest.raises(ValueError, match="has one band; leave colour=rggb out"):
+        study(grey, replace(settings, colour="rggb"))
 
 
 def test_blur_follows_from_the_structure_function(found):
