@@ -67,16 +67,16 @@ def oldest() -> tuple[str, ...]:
 def emulations() -> list[Emulation]:
     """All emulations; those that this machine cannot run are among them."""
     no_numpy = {"NPY_DISABLE_CPU_FEATURES": features_off()}
+    # All libraries of torch follow one processor: its own kernels, those of oneDNN and those of MKL.
     old = {"ONEDNN_MAX_CPU_ISA": "SSE41", "ATEN_CPU_CAPABILITY": "default", "MKL_CBWR": "COMPATIBLE"}
+    avx2 = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2", "MKL_CBWR": "AVX2"}
     return [
         Emulation("native"),
         *(Emulation(core.lower(), {"OPENBLAS_CORETYPE": core}, needs) for core, needs in BLAS_NEEDS.items()),
         Emulation("numpy-without-vectors", no_numpy),
-        Emulation("torch-sse41", {"ONEDNN_MAX_CPU_ISA": "SSE41", "ATEN_CPU_CAPABILITY": "default"}),
-        Emulation("torch-avx2", {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"}, "avx2"),
+        Emulation("torch-sse41", old),
+        Emulation("torch-avx2", avx2, "avx2"),
         Emulation("torch-avx512", {"ATEN_CPU_CAPABILITY": "avx512"}, "avx512dq"),
-        Emulation("mkl-compatible", {"MKL_CBWR": "COMPATIBLE"}),
-        Emulation("mkl-avx2", {"MKL_CBWR": "AVX2"}, "avx2"),
         Emulation("two-threads", dict.fromkeys(ONE_THREAD, "2")),
         Emulation("lowest", {"OPENBLAS_CORETYPE": "Prescott"} | no_numpy | old),
         Emulation("oldest", packages=oldest()),

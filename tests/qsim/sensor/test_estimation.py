@@ -162,7 +162,7 @@ def test_response_gives_the_light_of_a_mean_code_back(sensor: Sensor):
     [
         (QIS(0.37, 0.0, 30.0, 11, gain=45.0, full_well=20.7), 267),
         (QIS(0.53, 0.0, 30.0, 9, gain=18.4), 41),
-        (QIS(0.91, 0.0, 30.0, 14, gain=15.7), 128),
+        pytest.param(QIS(0.91, 0.0, 30.0, 14, gain=15.7), 128, marks=pytest.mark.slow),
         (QIS(0.085, 0.0, 30.0, 13, gain=210.2, offset=-95.9), 533),
     ],
 )

@@ -245,7 +245,10 @@ def test_nan_stops_with_step_samples_and_state(tiny_dataset, tmp_path):
     assert math.isfinite(float(saved["model"]["factor"]))
 
 
-@pytest.mark.parametrize(("network", "optimiser", "rate"), [("unet", "adam", 1e-3), ("quiver", "muon", 6e-3)])
+@pytest.mark.parametrize(
+    ("network", "optimiser", "rate"),
+    [("unet", "adam", 1e-3), pytest.param("quiver", "muon", 6e-3, marks=pytest.mark.slow)],
+)
 def test_ten_times_the_rate_stays_finite_or_stops(tiny_dataset, tmp_path, network, optimiser, rate):
     """200 steps of a protocol's optimiser; a narrow QUIVER saves time."""
     kinds = {"optimiser": optimiser, "learning_rate": 10 * rate, "loss": "scales-l1"}
