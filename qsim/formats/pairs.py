@@ -25,6 +25,7 @@ from numpy import ndarray as Array
 from qsim.checks import ArgumentError
 from qsim.clip.manifest import check_outside
 from qsim.files import VERSION, Progress, replacing
+from qsim.formats.hdf5_output import writable
 from qsim.formats.summing import summed
 from qsim.plane_sums import AS_STORED, PlaneSums
 from qsim.streams.clip import Clip
@@ -133,18 +134,17 @@ def write(
 
     `FileExistsError` if the file exists without `force`, or was not written by this function.
     """
-    import h5py
-
     groups = windows(splits, frames, sums)
     _check_target(path, force)
     path.parent.mkdir(parents=True, exist_ok=True)
     total = sum(map(len, groups.values()))
     done = 0
-    with replacing(path) as part, h5py.File(part.name, "w") as file:  # by name: HDF5 also reads what it wrote
+    with replacing(path) as part, writable(part) as (file, check):
         file.attrs.update({"format": "qsim-pairs-1", "software": f"qsim {VERSION}", "truth": "photons"})
         for split, listed in groups.items():
             for _ in _fill(file.create_group(split), listed):
                 done += 1
+                check()
                 if progress is not None:
                     progress(done, total)
     return _line(groups, frames)
