@@ -140,11 +140,11 @@ def _photon_codes(path: Path, bits: int, exposure: float, planes: int | None) ->
     if not math.isclose(exposure, stated, rel_tol=1e-3):  # typed by hand
         raise ValueError(f"{path}: an exposure of {exposure:g} s; the photon times state {stated:g} s, give that")
     if planes is None and bits > 1:
-        return np.asarray(np.minimum(photons.counts(), (1 << bits) - 1))
+        return photons.counter_codes(bits)
     parts = planes or 1
     if parts > _MOST_PLANES:
         raise ValueError(f"{path}: sums of {parts} planes; of photon times sums of at most {_MOST_PLANES} are made")
-    return np.asarray(photons.clocked(parts).reshape(-1, parts, *photons.shape[1:]).sum(axis=1))
+    return photons.sums(parts)
 
 
 def read_counts(
@@ -153,7 +153,7 @@ def read_counts(
     bits: int | None = None,
     exposure: float | None = None,
 ) -> Array:
-    """Return the frames [T, H, W] of an `.npy`, mapped, of a stream, read when they are used, or of a `.mat`.
+    """Return the frames [T, H, W] of an `.npy` or a stream, read when they are used, or of a `.mat`.
 
     With `hints` other than the `variable` of a `.mat`, of any recording of `convert`, all in memory. `ValueError` or
     `FileNotFoundError` naming the file, also for a stream of other `bits`, or whose codes have another `exposure` [s].
@@ -177,8 +177,8 @@ def read_counts(
         if recording.is_light:
             raise ValueError(f"{path}: holds {recording.format} of light, not counts")
         return recording.read(0, recording.shape[0])
-    array = load_array(path)
-    array = array[None] if array.ndim == 2 else array
+    stored = load_array(path)
+    array = cast(Array, stored[None] if stored.ndim == 2 else stored)
     if array.ndim != 3 or array.size == 0:
         raise ValueError(f"{path}: expected frames [T, H, W], found shape {list(array.shape)}")
     return array
@@ -332,6 +332,14 @@ def beside(path: Path) -> dict[str, Path]:
         "dark_count_rate": path.with_name(f"{path.stem}{_DARK_MAP}"),
         "hot_pixels": path.with_name(f"{path.stem}{_HOT_MAP}"),
     }
+
+
+def holds_values(path: Path) -> bool:
+    """Return whether a file is the values of a calibration, as `write` writes them beside its other files."""
+    try:
+        return files.read_json(path).keys() >= {"model", "bits", "values", "hot_pixels"}
+    except (OSError, ValueError):
+        return False
 
 
 def write(found: Calibration, path: Path, title: str, *, own_pixels: bool = False) -> list[Path]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypedDict
@@ -36,6 +37,7 @@ from qsim.streams.storing import stored
 from qsim.streams.stream import Stream
 
 FORMAT = "qsim-photons-1"
+_AT_ONCE = 1 << 22  # counts of 8 bytes that are held while codes are made of them
 _ARRAYS = {"times": "f8", "kind": "u1", "first": "i8", "meta": "u1"}
 
 
@@ -70,10 +72,41 @@ class PhotonTimes:
         frame = self._frame(found)
         return np.diff(found)[frame[1:] == frame[:-1]]
 
-    def counts(self) -> Array:
-        """Return the counts of every exposure, not clipped, int64 [T, H, W]."""
-        counted = self.kind & DETECTED > 0
-        return self._histogram(self._frame(self.times[counted]), self._pixel()[counted], self.shape[0])
+    def counts(self, start: int = 0, stop: int | None = None) -> Array:
+        """Return the counts of exposures start ... stop - 1, not clipped, int64 [T, H, W]."""
+        last = self.shape[0] if stop is None else stop
+        frame = self._frame(self.times)
+        counted = (self.kind & DETECTED > 0) & (frame >= start) & (frame < last)
+        return self._histogram(frame[counted] - start, self._pixel()[counted], last - start)
+
+    def counter_codes(self, bits: int, start: int = 0, stop: int | None = None) -> Array:
+        """Return the codes of a counter of so many bits, uint8 or uint16 [T, H, W]: its counts, clipped."""
+        top = (1 << bits) - 1
+        return self._in_blocks(lambda a, b: np.minimum(self.counts(a, b), top), top, 1, start, stop)
+
+    def sums(self, planes: int, start: int = 0, stop: int | None = None) -> Array:
+        """Return sums of the planes of exposures start ... stop - 1, uint8 or uint16 [T, H, W]; see `clocked`."""
+
+        def block(a: int, b: int) -> Array:
+            return self.clocked(planes, a, b).reshape(-1, planes, *self.shape[1:]).sum(axis=1)
+
+        return self._in_blocks(block, planes, planes, start, stop)
+
+    def _in_blocks(
+        self, made: Callable[[int, int], Array], top: int, planes: int, start: int, stop: int | None
+    ) -> Array:
+        """Return what is made of exposures, up to `top`; few of these are counted at a time."""
+        last = self.shape[0] if stop is None else stop
+        if (last - start) * planes * math.prod(self.shape[1:]) > limits.COUNTS:
+            raise ValueError(
+                f"{last - start} exposures of {planes} planes of {list(self.shape[1:])} are too many to read at once"
+            )
+        found = np.empty((last - start, *self.shape[1:]), np.uint8 if top < 256 else np.uint16)
+        step = max(1, _AT_ONCE // (planes * math.prod(self.shape[1:])))
+        for first in range(start, last, step):
+            end = min(first + step, last)
+            found[first - start : end - start] = made(first, end)
+        return found
 
     def first_photons(self) -> Array:
         """Return the time [s] from the start of each exposure to its first count, float64 [T, H, W]; NaN for none."""
@@ -86,18 +119,20 @@ class PhotonTimes:
         found[np.isinf(found)] = np.nan
         return found.reshape(self.shape)
 
-    def clocked(self, planes: int) -> Array:
-        """Return the planes of a clocked SPAD that saw the same photons, bool [T planes, H, W].
+    def clocked(self, planes: int, start: int = 0, stop: int | None = None) -> Array:
+        """Return the planes of a clocked SPAD that saw the same photons, bool [T planes, H, W], of some exposures.
 
         Each exposure is divided into `planes` equal ones; a plane fires if any photon or dark count came in it, dead
         time or not. Released carriers are the counter's own and do not count.
         """
-        frames = self.shape[0]
-        arrived = self.kind & RELEASED == 0
+        last = self.shape[0] if stop is None else stop
+        frame = self._frame(self.times)
+        arrived = (self.kind & RELEASED == 0) & (frame >= start) & (frame < last)
         times = self.times[arrived]
-        frame = self._frame(times)
+        frame = frame[arrived]
         part = np.clip((times - frame / self.frame_rate) / self.exposure * planes, 0, planes - 1).astype(np.int64)
-        return self._histogram(frame * planes + part, self._pixel()[arrived], frames * planes) > 0
+        plane = (frame - start) * planes + part
+        return self._histogram(plane, self._pixel()[arrived], (last - start) * planes) > 0
 
     def _events(self, y: int, x: int) -> slice:
         _, height, width = self.shape
@@ -176,15 +211,15 @@ def read_photons(path: Path, hints: Hints) -> Recording:
     planes = 2**bits - 1
     if planes * math.prod(photons.shape) > limits.COUNTS:
         raise ValueError(f"{path}: states {planes} planes of {list(photons.shape)}, too many to read at once")
-    fired = photons.clocked(planes).reshape(-1, planes, *photons.shape[1:])
-    codes = fired.sum(axis=1, dtype=np.uint8)
     rate = photons.frame_rate
     exposure = photons.exposure
     rows = photons.rows
     source = Source(format="photon times")
     if rows is not None:
         source = replace(source, row_delay=rows.delay, row_order=rows.order)
-    return Recording(photons.shape, lambda a, b: codes[a:b], source, bits, frame_rate=rate, exposure=exposure)
+    return Recording(
+        photons.shape, lambda a, b: photons.sums(planes, a, b), source, bits, frame_rate=rate, exposure=exposure
+    )
 
 
 def _arrays(path: Path) -> dict[str, Array]:
@@ -201,7 +236,7 @@ def _arrays(path: Path) -> dict[str, Array]:
         found: dict[str, Any] = {}
         for name, kind in _ARRAYS.items():
             with archive.open(f"{name}.npy") as file:
-                found[name] = np.lib.format.read_array(file, allow_pickle=False)
+                found[name] = files.read_npy(path, file)
             if found[name].dtype != np.dtype(f"<{kind}") or found[name].ndim != 1:
                 raise ValueError(f"{path}: {name} is {found[name].dtype} {list(found[name].shape)}, not {kind} [n]")
     return found
