@@ -205,8 +205,8 @@ def calibrate(asked: Calibrate, layout: Layout, sums: PlaneSums) -> int:
 
 
 def _check_outputs(asked: Calibrate, model: str) -> None:
-    """Raise an `OSError` if a file to write exists without --force, or is an input."""
-    from qsim.calibration.sensor_file import beside, stream_of
+    """Raise an `OSError` if a file to write exists without --force, is an input, or lies beside as another's."""
+    from qsim.calibration.sensor_file import beside, holds_values, stream_of
 
     written = beside(asked.output)
     if not (model == "spad" and asked.dark):
@@ -221,6 +221,9 @@ def _check_outputs(asked: Calibrate, model: str) -> None:
             if given.exists() and any(place.samefile(given) for place in places):
                 raise FileExistsError(f"{path}: would replace a file of the input {given}; name another with -o")
         refuse_existing(path, asked.force)
+    there = [path for path in written.values() if path.exists()]
+    if there and not holds_values(written["values"]):
+        raise FileExistsError(f"{there[0]}: was not written by a calibration; move it away, or name another with -o")
 
 
 def _calibration_kind(asked: Calibrate, sums: PlaneSums) -> tuple[str, int]:

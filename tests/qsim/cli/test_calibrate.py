@@ -205,14 +205,20 @@ def test_a_recording_is_never_replaced(folder, capsys, dark, output, replaced, f
 
 @pytest.mark.parametrize("name", ["a.json", "a.png", "a_dark.npy"])
 def test_files_beside_the_sensor_file_are_replaced_with_force_only(folder, capsys, name):
+    """And only beside the values of a calibration: others are somebody else's."""
     Path(name).touch()
     words = "calibrate --model spad --bits 1 --dark dark_planes.npy 1e-5 --flat flat_planes.npy 1e-5 0.9 -o a.toml"
     before = contents(folder)
     assert main(words.split()) == 2
     assert f"{name}: exists; name another, or replace it with --force" in capsys.readouterr().err
+    assert main([*words.split(), "--force"]) == 2
+    assert f"{name}: was not written by a calibration" in capsys.readouterr().err
     assert contents(folder) == before
+    Path(name).unlink()
+    assert main(words.split()) == 0
+    made = contents(folder)
     assert main([*words.split(), "--force"]) == 0
-    assert Path(name).stat().st_size > 0
+    assert contents(folder) == made
 
 
 def test_packed_planes_without_a_count_are_read_by_their_width(folder, capsys):
