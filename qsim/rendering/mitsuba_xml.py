@@ -18,13 +18,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from qsim import files, limits, opening
+from qsim import files, limits
 from qsim.checks import file_path, suggest
 from qsim.device_lock import one_thread_at_a_time
 from qsim.host import own_numbers
 from qsim.optics.camera import Camera, Pose, Vector
 from qsim.optics.lens import Lens
 from qsim.optics.radiometry import RGB
+from qsim.rendering import mitsuba_files
 from qsim.rendering.engine import activate, errors_only, in_colour, select
 from qsim.rendering.mitsuba_mesh import POSITIONS
 from qsim.scene import MitsubaFile, Part, Scene
@@ -163,7 +164,7 @@ def load(mi: Any, path: str) -> Any:
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file")
     _refuse_hidden_lights(Path(path))
-    _refuse_pipes(Path(path))
+    mitsuba_files.check(Path(path))
     try:
         with errors_only(mi):  # it warns that a colour film becomes grey; no film is used
             # Optimising would merge shapes and lose their names.
@@ -178,39 +179,6 @@ def load(mi: Any, path: str) -> Any:
         if not shape.id():
             shape.set_id(f"shape {i}")
     return loaded
-
-
-def _refuse_pipes(document: Path) -> None:
-    """Raise `ValueError` for a file that a scene names and that is no regular one: Mitsuba would wait for a pipe.
-
-    Files are looked for where Mitsuba does: beside the document, in folders that it names, and in the working one.
-    """
-    waiting = [document]
-    seen: set[Path] = set()
-    while waiting and len(seen) < limits.SCENE_FILES:
-        path = waiting.pop()
-        if path in seen or path.suffix.lower() != ".xml":
-            continue
-        seen.add(path)
-        try:
-            found = list(ElementTree.fromstring(opening.content(path)).iter())
-        except (ElementTree.ParseError, RecursionError):
-            continue  # Mitsuba reports the error
-        folders = [
-            path.parent,
-            document.parent,
-            Path(),
-            *(path.parent / e.get("value", ".") for e in _of(found, "path")),
-        ]
-        names = {e.get("value", "") for e in _of(found, "string") if e.get("name") == "filename"}
-        names |= {e.get("filename", "") for e in _of(found, "include")}
-        for place in (folder / name for name in names - {""} for folder in dict.fromkeys(folders)):
-            if place.exists():
-                waiting.append(opening.regular(place))
-
-
-def _of(found: list[ElementTree.Element], tag: str) -> list[ElementTree.Element]:
-    return [element for element in found if element.tag == tag]
 
 
 def _refuse_hidden_lights(path: Path) -> None:
