@@ -25,6 +25,11 @@ def printable(text: str) -> str:
     return _CONTROLS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
+def in_one_line(text: str) -> str:
+    """Return a text as `printable`, with line ends and tabs as escapes, too: a name that holds them."""
+    return printable(text).replace("\n", "\\n").replace("\t", "\\t")
+
+
 class Tolerant:
     """A text stream that drops what cannot be written; None stands for a stream that the process lacks."""
 

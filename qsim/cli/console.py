@@ -28,7 +28,7 @@ from qsim.cli.usage import Program, UsageError
 from qsim.files import FULL, Progress, wording
 from qsim.process import peak_memory
 from qsim.scratch import sweep
-from qsim.terminal import printable, tolerant_output
+from qsim.terminal import in_one_line, printable, tolerant_output
 
 SHOWN_AFTER = 2.0  # s, before a progress bar appears
 PILOT = "pilot and compilation of kernels"  # before the first frame of a renderer
@@ -151,7 +151,8 @@ def _answered(program: Program, command: Command, values: Mapping[str, Any], sta
             raise
         return failed(f"{program.name}: {one_line(error)}; name the file itself", 2, state.printing.json)
     except KeyboardInterrupt:
-        return failed(f"\n{program.name}: interrupted; {_then(state)}", 130, state.printing.json)
+        print(file=sys.stderr)  # after the ^C of the terminal
+        return failed(f"{program.name}: interrupted; {_then(state)}", 130, state.printing.json)
     finally:
         if state.printing.verbose:
             spent = time.perf_counter() - started
@@ -196,9 +197,9 @@ def _limit(threads: str) -> None:
 
 def failed(text: str, code: int, as_json: bool) -> int:
     """Print why a command failed, with --json also as an object on stdout; return its exit code."""
-    print(printable(text), file=sys.stderr)
+    print(in_one_line(text), file=sys.stderr)
     if as_json:
-        print(json.dumps({"error": text.strip(), "exit_code": code}, sort_keys=True))
+        print(json.dumps({"error": text, "exit_code": code}, sort_keys=True))
     return code
 
 
@@ -225,7 +226,7 @@ def in_options(text: str) -> str:
 def note(text: str) -> None:
     """Print a line on stderr, unless the command runs with --quiet."""
     if not running().printing.quiet:
-        print(printable(text), file=sys.stderr)
+        print(in_one_line(text), file=sys.stderr)
 
 
 def one_line(error: BaseException) -> str:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qsim.cli import demo
+from qsim.cli import demo, program
 from qsim.cli.program import main
 from qsim.terminal import printable
 
@@ -50,3 +50,10 @@ def test_no_command_prints_the_controls_of_a_name(words: str, tmp_path: Path, mo
     shown = capsys.readouterr()
     assert r"red\x1b[31m" in shown.out + shown.err
     assert not set(shown.out + shown.err) & {"\x1b", "\x07", "\u202e"}
+
+
+def test_a_message_with_a_name_of_two_lines_is_one_line(capsys):
+    for words in (["check", "a\nqsim: every file is whole"], ["a\n\tb"], ["check", "--a\nb"]):
+        assert program.main(words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("qsim")
