@@ -13,6 +13,7 @@ import errno
 import gzip
 import hashlib
 import json
+import math
 import os
 import re
 import shutil
@@ -25,8 +26,10 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 
 from qsim import opening
+from qsim.lazy_array import LazyArray
 from qsim.parsing import parse_json, parse_toml
 from qsim.scratch import Scratch, is_scratch, sweep
+from qsim.stored_array import StoredArray
 from qsim.thread_warnings import warnings_here
 
 Progress = Callable[[int, int], None]  # is called with (done, total)
@@ -301,32 +304,32 @@ def decoding_errors(path: Path, what: str) -> Iterator[None]:
         raise ValueError(f"{path}: not readable as {what} ({text or type(error).__name__})") from None
 
 
-def load_array(path: Path, beside: Path | None = None) -> np.ndarray:
-    """Return a .npy array of numbers as a memory map, or a .npy.gz in memory; `beside` as of `opening.opened`.
+def load_array(path: Path, beside: Path | None = None) -> LazyArray:
+    """Return a .npy array of numbers, read when it is used, or a .npy.gz in memory; `beside` as of `opening.opened`.
 
     `FileNotFoundError`, or `ValueError` for other files, objects, a number without axes, and wrong headers.
     """
     if path.suffix == ".gz":
         with decoding_errors(path, "gzipped .npy"), opening.opened(path) as file, gzip.open(file, "rb") as packed:
-            return read_npy(path, packed)
-    with decoding_errors(path, ".npy"):
-        with opening.opened(path, beside=beside) as file:
-            if file.read(2) == b"PK":
-                raise ValueError(f"{path}: is an archive (.npz) under another name; save the array alone with np.save")
-        array = np.lib.format.open_memmap(path, mode="r")
-        if array.ndim == 0:
-            raise ValueError(f"{path}: a single number without axes; an array is expected")
-        if array.dtype.hasobject or array.dtype.kind not in "buif":
-            raise ValueError(f"{path}: an array of {array.dtype}; numbers are expected")
-        if array.ndim and array.nbytes + 64 > path.stat().st_size:
-            raise ValueError(f"{path}: the header states {array.nbytes} bytes, the file has {path.stat().st_size}")
-        return array
+            array = read_npy(path, packed)
+            return LazyArray(array.shape, array.dtype, lambda start, stop, _: array[start:stop])
+    with decoding_errors(path, ".npy"), opening.opened(path, beside=beside) as file:
+        if file.read(2) == b"PK":
+            raise ValueError(f"{path}: is an archive (.npz) under another name; save the array alone with np.save")
+        file.seek(0)
+        shape, fortran, dtype = read_npy_header(path, file)
+        start = file.tell()
+        size = os.fstat(file.fileno()).st_size
+        wanted = math.prod(shape) * dtype.itemsize
+        if start + wanted > size:
+            raise ValueError(f"{path}: the header states {wanted} bytes, the file has {size - start}")
+        return StoredArray(path, os.dup(file.fileno()), start, shape, dtype, fortran=fortran)
 
 
-def read_npy(path: Path, file: IO[bytes] | gzip.GzipFile) -> np.ndarray:
-    """Return a .npy array of numbers from a stream; memory grows with the bytes that are there, not with the header.
+def read_npy_header(path: Path, file: IO[bytes] | gzip.GzipFile) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, order (True: Fortran's) and type of a .npy array of numbers from a stream, up to its first value.
 
-    `ValueError` as for `load_array`, with the name `path`; errors of the stream itself are its own.
+    `ValueError` for objects, a number without axes, and versions that are not known.
     """
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
@@ -337,7 +340,16 @@ def read_npy(path: Path, file: IO[bytes] | gzip.GzipFile) -> np.ndarray:
         raise ValueError(f"{path}: an array of {dtype}; numbers are expected")
     if not shape:
         raise ValueError(f"{path}: a single number without axes; an array is expected")
-    wanted = int(np.prod(shape, dtype=object)) * dtype.itemsize
+    return shape, fortran, dtype
+
+
+def read_npy(path: Path, file: IO[bytes] | gzip.GzipFile) -> np.ndarray:
+    """Return a .npy array of numbers from a stream; memory grows with the bytes that are there, not with the header.
+
+    `ValueError` as for `load_array`, with the name `path`; errors of the stream itself are its own.
+    """
+    shape, fortran, dtype = read_npy_header(path, file)
+    wanted = math.prod(shape) * dtype.itemsize
     content = bytearray()
     while len(content) < wanted:
         block = file.read(min(1 << 24, wanted - len(content)))

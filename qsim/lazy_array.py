@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy import ndarray as Array
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from qsim.optics.radiometry import Crop
+Crop = tuple[int, int, int, int]  # y, x, height, width
 
 
 class LazyArray(NDArrayOperatorsMixin):
@@ -29,6 +30,20 @@ class LazyArray(NDArrayOperatorsMixin):
 
     def __len__(self) -> int:
         return self.shape[0]
+
+    @property
+    def size(self) -> int:
+        """The number of values."""
+        return math.prod(self.shape)
+
+    @property
+    def nbytes(self) -> int:
+        """The bytes of all values in memory."""
+        return self.size * self.dtype.itemsize
+
+    def channel(self, number: int) -> LazyArray:
+        """Return entry `number` of the last axis, [T, ...], read when it is used."""
+        return LazyArray(self.shape[:-1], self.dtype, lambda start, stop, _: self(start, stop)[..., number])
 
     def __iter__(self) -> Iterator[Array]:
         return (self[t] for t in range(len(self)))

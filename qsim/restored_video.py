@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from msgspec import Meta
-from numpy import ndarray as Array
 
 from qsim import descriptions, files, records
 from qsim.checks import check_video
 from qsim.files import Progress, load_array
 from qsim.frame_times import Times
 from qsim.kinds import Count, Digest, NotNegative, Positive, Text, Whole
+from qsim.lazy_array import LazyArray
 from qsim.plane_sums import PlaneRange
 
 _CURE = "restore the video again"
@@ -95,8 +95,8 @@ class Restored:
         """Open a restored video by its description; `ValueError` if that is damaged."""
         return Restored(description.with_suffix(".npy"), descriptions.read(description, RestoredInfo, _CURE))
 
-    def frames(self) -> Array:
-        """Return the video, float32 photons, as a memory map; `ValueError` if it differs from its .json."""
+    def frames(self) -> LazyArray:
+        """Return the video, float32 photons, read when it is used; `ValueError` if it differs from its .json."""
         array = load_array(self.path, self.path.parent)
         check_video(self.path, array.shape)
         if array.dtype.kind != "f" or self.info.shape not in (None, array.shape):

@@ -27,11 +27,11 @@ from qsim import opening
 from qsim.checks import file_path
 from qsim.clip import exr
 from qsim.clip.clip_info import ClipInfo, frame_file
-from qsim.clip.lazy_array import LazyArray
 from qsim.clip.manifest import TRUTH, read_info
 from qsim.host import own_numbers
+from qsim.lazy_array import Crop, LazyArray
 from qsim.optics.camera import Camera
-from qsim.optics.radiometry import Crop, check_crop
+from qsim.optics.radiometry import check_crop
 
 
 @own_numbers

@@ -22,7 +22,7 @@ from numpy import ndarray as Array
 from qsim import limits, opening
 from qsim.arrays import plain
 from qsim.files import decoding_errors, native
-from qsim.optics.radiometry import Crop
+from qsim.lazy_array import Crop
 
 MAGIC = bytes((0x76, 0x2F, 0x31, 0x01)) + struct.pack("<i", 2)
 _PIXEL_TYPES = {np.dtype("<u4"): 0, np.dtype("<f2"): 1, np.dtype("<f4"): 2}

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from numpy import ndarray as Array
 
 from qsim import colour
-from qsim.clip.lazy_array import LazyArray
+from qsim.lazy_array import LazyArray
 
 MOST_FRAMES = 100  # of a film, unless more are requested
 NARROWEST = 256  # px, at which pictures are shown

@@ -33,6 +33,7 @@ from qsim.formats.recording import (
     reached,
     white_of,
 )
+from qsim.lazy_array import LazyArray
 from qsim.parsing import parse_json
 from qsim.sensor import packing
 
@@ -65,7 +66,7 @@ def read_cube(path: Path, hints: Hints) -> Recording:
     if array.ndim == 4:
         if hints.channel is None or not 0 <= hints.channel < array.shape[3]:
             raise ValueError(f"{path}: a colour cube of {array.shape[3]} channels; choose one with channel=0")
-        array = array[..., hints.channel]
+        array = array.channel(hints.channel)
     if array.dtype != np.uint8 or array.ndim != 3:
         raise ValueError(f"{path}: a photon cube is uint8 [T, H, bytes], found {array.dtype} {list(array.shape)}")
     frames, height, columns = check_shape(path, array.shape)
@@ -254,7 +255,7 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     if not shards:
         raise FileNotFoundError(f"{path}: holds neither frames.npy nor 0000.npy")
     channel = hints.channel or 0
-    first = load_array(shards[0])
+    first = load_array(shards[0], path)
     channels = first.shape[3] if first.ndim == 4 else 1
     if channels > 1 and hints.channel is None:
         raise ValueError(f"{path}: {channels} colour planes; choose one with channel=0")
@@ -287,14 +288,14 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     return Recording(shape, read, Source(format="visionsim", bit_order="msb", bitplanes=odd), bits, model)
 
 
-def _shard(path: Path, channel: int, channels: int, columns: int, width: int) -> Array:
+def _shard(path: Path, channel: int, channels: int, columns: int, width: int) -> LazyArray:
     """Return one colour plane [T, H, columns] of a shard; `ValueError` for another type or shape."""
-    array = load_array(path)
+    array = load_array(path, path.parent)
     if array.dtype.kind != "u" or array.ndim != 4 or channel >= array.shape[3]:
         raise ValueError(f"{path}: expected unsigned [T, H, W, {channels}], found {array.dtype} {list(array.shape)}")
     if array.shape[2] != columns:
         raise ValueError(f"{path}: {array.shape[2]} columns do not hold the width {width} of transforms.json")
-    return array[..., channel]
+    return array.channel(channel)
 
 
 def _bits_of_sums(path: Path, planes: int, bits: int | None) -> int:

@@ -24,6 +24,7 @@ from qsim import files, opening
 from qsim.checks import check_shape
 from qsim.colour import from_linear
 from qsim.files import decoding_errors, load_array
+from qsim.lazy_array import LazyArray
 from qsim.sensor import packing
 from qsim.sensor.colour_filter import MASKS
 from qsim.streams.clip import Clip
@@ -118,7 +119,7 @@ class Cube:
 
     scene: str
     path: Path  # SCENE/000000.npy
-    packed: Array  # uint8 [T, H, ceil(W/8), 3]
+    packed: LazyArray  # uint8 [T, H, ceil(W/8), 3]
     width: int  # pixels, before packing
 
     @property

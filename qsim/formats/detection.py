@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy import ndarray as Array
 
 from qsim.files import load_array
 from qsim.formats import array_files, hdf5, images, mat_files, photon_times, raw_cameras, raw_layout, tcspc, video
 from qsim.formats.recording import Hints, Recording
+from qsim.lazy_array import LazyArray
 
 Reader = Callable[[Path, Hints], Recording]
 SMOOTH = 1.5  # roughness below which a layout may be right, and how much rougher the next one must then be
@@ -181,7 +181,7 @@ def _detect_npy(path: Path, hints: Hints) -> str:
     return "cube"
 
 
-def _smooth(array: Array) -> bool:
+def _smooth(array: LazyArray) -> bool:
     """Return whether neighbours along the rows of uint8 [T, H, W] agree, as pixels do and bytes of planes do not."""
     if array.ndim != 3 or array.shape[2] < 2 or array.size == 0:
         return False

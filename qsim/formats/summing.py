@@ -14,7 +14,7 @@ from numpy import ndarray as Array
 from qsim.checks import ArgumentError
 from qsim.files import Progress
 from qsim.formats.importing import free_stream
-from qsim.optics.radiometry import Crop
+from qsim.lazy_array import Crop
 from qsim.plane_sums import PlaneSums, Read, Sums
 from qsim.sensor import packing
 from qsim.streams.stream import Stream, write_packed

@@ -20,6 +20,7 @@ from numpy import ndarray as Array
 from qsim.arrays import plain
 from qsim.host import own_numbers
 from qsim.kinds import LARGEST, SMALLEST
+from qsim.lazy_array import Crop
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
 
@@ -72,8 +73,6 @@ V_LAMBDA = (
 )  # of 380 to 780 nm in steps of 10 nm; CIE 1924
 RGB = (610e-9, 540e-9, 460e-9)  # m, of the bands R, G and B of colour clips unless a scene states others
 WHITE_PER_MEAN = 2.5  # white of a clip or stream over its mean light: the peak of scores and of requested errors
-
-Crop = tuple[int, int, int, int]  # y, x, height, width
 
 
 def check_crop(crop: Crop, height: int, width: int, where: str = "") -> Crop:

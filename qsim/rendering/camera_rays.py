@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.lazy_array import Crop
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
-from qsim.optics.radiometry import Crop
 
 MAX_SAMPLES_IN_FLIGHT = 2**23  # samples in flight, about; a frame with more is rendered in parts
 GRID = 129  # columns and lines of slopes known to a lens with tangential terms; the same test measures the rest

@@ -11,9 +11,10 @@ from qsim import files, records
 from qsim.clip.clip_info import PHYSICAL, ClipInfo, FlickerInfo, Matrix, Origin, RenderInfo, SceneName
 from qsim.clip.writer import ClipWriter
 from qsim.host import own_numbers
+from qsim.lazy_array import Crop
 from qsim.rendering.budget import Budget
 from qsim.rendering.engine import free_memory
-from qsim.rendering.renderer import Crop, Renderer
+from qsim.rendering.renderer import Renderer
 from qsim.scene import Scene
 from qsim.streams.clip import Clip
 

@@ -30,7 +30,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import clamped_squares
-from qsim.optics.radiometry import Crop
+from qsim.lazy_array import Crop
 
 AROUND = 33  # px, side of the square around a pixel in which errors are compared
 Kind = TypeVar("Kind", bound="Mixture")

@@ -26,7 +26,8 @@ from qsim.clip.clamped_error import Errors, StatedError, error_at, frame_errors,
 from qsim.device_lock import one_thread_at_a_time
 from qsim.host import own_numbers
 from qsim.keys import Key, hash_name, words
-from qsim.optics.radiometry import Crop, check_crop
+from qsim.lazy_array import Crop
+from qsim.optics.radiometry import check_crop
 from qsim.rendering import ground_truth
 from qsim.rendering.budget import Budget, as_bright, blur_left, grid_samples, instants, light_windows
 from qsim.rendering.camera_rays import CameraRays, Film

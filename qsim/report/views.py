@@ -23,6 +23,7 @@ from qsim.checks import ArgumentError, check_shape, check_video
 from qsim.colour import bright_end
 from qsim.files import load_array
 from qsim.formats.recording import checked_codes
+from qsim.lazy_array import LazyArray
 from qsim.plane_sums import AS_STORED, PlaneSums, within_sum
 from qsim.restored_video import Restored, RestoredInfo, describes_restored
 from qsim.sensor import packing
@@ -167,8 +168,8 @@ def _stream_source(stream: Stream, sums: PlaneSums = AS_STORED) -> Source:
 def _array_source(
     path: Path, bits: int | None, width: int | None, video: RestoredInfo | None, sums: PlaneSums
 ) -> Source:
-    array = load_array(path)
-    array = array[None] if array.ndim == 2 else array
+    stored = load_array(path)
+    array = stored[None] if stored.ndim == 2 else stored
     in_colour = video is not None and bool(video.colour)
     length = (check_video if in_colour else check_shape)(path, array.shape)[0]
     rate = None if video is None else video.frame_rate
@@ -202,7 +203,7 @@ def _array_source(
     return _bare_source(path, bits, length, read, sums)
 
 
-def _bits_of_planes(path: Path, array: NDArray[Any]) -> int:
+def _bits_of_planes(path: Path, array: NDArray[Any] | LazyArray) -> int:
     """Return the bits of single planes; `ValueError` for values that are none, as bytes of packed planes."""
     if array[0].max() > 1:
         raise ValueError(f"{path}: whole numbers above 1 are no single planes; of packed planes give width=")
@@ -222,7 +223,7 @@ def _bare_source(
     return Source(path.stem, taken.codes, None, views, of_planes.words(None) if sums.any else "")
 
 
-def _packed_source(path: Path, array: NDArray[Any], width: int, sums: PlaneSums) -> Source:
+def _packed_source(path: Path, array: NDArray[Any] | LazyArray, width: int, sums: PlaneSums) -> Source:
     if array.dtype != np.uint8 or width < 1 or packing.packed_width(width, 1) != array.shape[2]:
         raise ValueError(
             f"{path}: {array.dtype} {list(array.shape)} does not hold packed planes of {width} columns; "

@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.composed_flow import composed
-from qsim.optics.radiometry import Crop
+from qsim.lazy_array import Crop
 from qsim.streams.exposures import Exposures, Timing
 from qsim.streams.photons import clip_photons
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip_folder import ClipFolder
-from qsim.optics.radiometry import Crop
+from qsim.lazy_array import Crop
 from qsim.streams.rows import Rows
 
 UNEVEN = 0.01  # of the mean strength of a light, a difference that is stated

@@ -10,10 +10,10 @@ from numpy import ndarray as Array
 
 from qsim.clip.clip_folder import ClipFolder
 from qsim.host import own_numbers
+from qsim.lazy_array import Crop
 from qsim.optics.camera import checked_pitch
 from qsim.optics.diffraction import diffract
 from qsim.optics.radiometry import (
-    Crop,
     LightLevel,
     band_photons,
     expected_photons,

@@ -22,7 +22,7 @@ from numpy import ndarray as Array
 
 from qsim import records
 from qsim.kinds import Positive, RowOrder
-from qsim.optics.radiometry import Crop
+from qsim.lazy_array import Crop
 
 Read = Callable[[int, Crop], Array]  # clip frame, crop (y, x, height, width) -> light [h, w]
 

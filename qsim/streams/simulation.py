@@ -15,7 +15,8 @@ from numpy import ndarray as Array
 from qsim.clip.clip_folder import ClipFolder
 from qsim.files import Progress
 from qsim.keys import Key
-from qsim.optics.radiometry import Crop, LightLevel
+from qsim.lazy_array import Crop
+from qsim.optics.radiometry import LightLevel
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.defects import event_simulation
 from qsim.sensor.defects.defect_table import Defects

@@ -23,10 +23,10 @@ from qsim import colour, descriptions, files, locks, scratch
 from qsim.checks import file_path
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
-from qsim.clip.lazy_array import LazyArray
 from qsim.files import VERSION, Progress
 from qsim.host import own_numbers
-from qsim.optics.radiometry import Crop, check_crop
+from qsim.lazy_array import Crop, LazyArray
+from qsim.optics.radiometry import check_crop
 from qsim.plane_sums import Sums
 from qsim.sensor import packing
 from qsim.sensor.defects import defect_table, good_pixels
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from qsim.sensor.colour_filter import ColourFilter
     from qsim.sensor.sensor import Sensor
 
+IN_CACHE = 1 << 18  # packed bytes that are unpacked at once
 _DAMAGED = "the file is damaged: sense it again and replace it"
 
 
@@ -243,15 +244,15 @@ class Stream:
         return devices.from_dict(self.info.sensor, where=f"{self.path.with_suffix('.json')}: sensor")
 
     @cached_property
-    def packed(self) -> Array:
-        """The packed array uint8 [T, H, ceil(W*bits/8)] as a memory map.
+    def packed(self) -> LazyArray:
+        """The packed array uint8 [T, H, ceil(W*bits/8)], read when it is used.
 
         `ValueError` if the file does not fit its json, or if both were replaced since the stream was opened. Once
-        mapped, the codes stay those of this json.
+        open, the codes stay those of this json. Reading raises `ValueError` if the file was cut or overwritten.
         """
         while True:
             before = self._written()
-            array = self._mapped()
+            array = self._stored()
             if self._written() == before:  # nothing was replaced between reading json and codes
                 return array
 
@@ -268,8 +269,8 @@ class Stream:
             raise ValueError(problem)
         return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
-    def _mapped(self) -> Array:
-        """Return the memory map uint8 [T, H, ceil(W*bits/8)]; `ValueError` for another shape or type."""
+    def _stored(self) -> LazyArray:
+        """Return the open array uint8 [T, H, ceil(W*bits/8)]; `ValueError` for another shape or type."""
         frames, height, width = self.shape
         expected = (frames, height, packing.packed_width(width, self.bits))
         if not self.path.is_file():
@@ -282,26 +283,28 @@ class Stream:
             )
         return array
 
-    def _check_length(self) -> None:
-        """Raise `ValueError` if the mapped file became shorter: behind its end are zeros, or the end of the process."""
-        mapped = getattr(self.packed, "_mmap", None)  # None: a copy, after pickling
-        if mapped is not None and mapped.size() < self._bytes:
-            raise ValueError(f"{self.path}: became shorter since it was opened; sense it again and replace it")
-
     def _read(self, start: int, stop: int, crop: Crop | None) -> Array:
         """Return codes [stop - start, h, w] of frames start ... stop - 1; only the bytes of the crop are read."""
         self._existing(start, stop)
         _, height, width = self.shape
-        self._check_length()
-        if crop is None:
-            return packing.unpack(np.asarray(self.packed[start:stop]), self.bits, width)
-        y, x, h, w = check_crop(crop, height, width, str(self.path))
+        y, x, h, w = (0, 0, height, width) if crop is None else check_crop(crop, height, width, str(self.path))
         # The packed bytes that hold the columns: from the last code that starts on a byte.
         first = x - x % (8 // math.gcd(8, self.bits))
         low = first * self.bits // 8
         high = packing.packed_width(x + w, self.bits)
-        part = np.asarray(self.packed[start:stop, y : y + h, low:high])
-        return packing.unpack(part, self.bits, x + w - first)[..., x - first :]
+
+        def block(begin: int, end: int) -> Array:
+            part = self.packed[begin:end, y : y + h, low:high]
+            return packing.unpack(part, self.bits, x + w - first)[..., x - first :]
+
+        step = max(1, IN_CACHE // max(1, h * (high - low)))
+        if stop - start <= step:
+            return block(start, stop)
+        codes = np.empty((stop - start, h, w), packing.code_dtype(self.bits))
+        for begin in range(start, stop, step):
+            end = min(begin + step, stop)
+            codes[begin - start : end - start] = block(begin, end)
+        return codes
 
     @property
     def _bytes(self) -> int:

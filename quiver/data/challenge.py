@@ -32,7 +32,7 @@ def band_codes(cube: Cube, colour: int, planes: int) -> Codes:
     frames, height, width = cube.shape
     if frames < planes:
         raise ArgumentError("planes", f"{cube.path}: has {frames}, fewer than the {planes} of one code; give fewer")
-    packed = cube.packed[..., colour]
+    packed = cube.packed.channel(colour)
 
     def read(start: int, stop: int) -> Array:
         return np.unpackbits(plain(packed[start:stop]), axis=2, count=width)

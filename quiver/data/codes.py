@@ -21,11 +21,11 @@ from numpy import ndarray as Array
 from qsim import records
 from qsim.arrays import plain
 from qsim.checks import ArgumentError
-from qsim.clip.lazy_array import LazyArray
 from qsim.files import read_json, sha256, to_json, wording
 from qsim.formats import summing
 from qsim.frame_times import Times
 from qsim.keys import Key, hash_name
+from qsim.lazy_array import LazyArray
 from qsim.plane_sums import PlaneSums, Sums
 from qsim.restored_video import describes_restored
 from qsim.sensor.colour_filter import ColourFilter
@@ -272,8 +272,8 @@ def _pooled(image: Array) -> tuple[Array, Array]:
     return sums / pixels, pixels
 
 
-def array_digest(array: Array) -> str:
-    """Return the SHA-256 of an array's type, shape and values. A memory map is read in blocks."""
+def array_digest(array: Array | LazyArray) -> str:
+    """Return the SHA-256 of an array's type, shape and values. One in a file is read in blocks."""
     found = hashlib.sha256(f"{array.dtype.newbyteorder('=').str} {array.shape}".encode())
     step = max(1, DIGEST_BYTES // max(1, array[:1].nbytes))
     for start in range(0, len(array), step):
@@ -281,8 +281,10 @@ def array_digest(array: Array) -> str:
     return found.hexdigest()
 
 
-def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "codes", source: str = "memory") -> Codes:
-    """Return codes [T, H, W] in memory or in a memory map; truth values are codes of 0 and 1. `ValueError` if empty, or
+def array_codes(
+    codes: Array | LazyArray, sensor: Sensor, exposure: float, name: str = "codes", source: str = "memory"
+) -> Codes:
+    """Return codes [T, H, W] in memory or in a file; truth values are codes of 0 and 1. `ValueError` if empty, or
     for codes that the sensor cannot produce.
     """
     if codes.ndim != 3 or codes.size == 0 or codes.dtype.kind not in "iub":
@@ -303,7 +305,10 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
             )
         return part
 
-    return Codes(name, codes.shape, sensor, exposure, 1 / exposure, read, source, lambda: array_digest(codes))
+    frames, height, width = codes.shape
+    return Codes(
+        name, (frames, height, width), sensor, exposure, 1 / exposure, read, source, lambda: array_digest(codes)
+    )
 
 
 def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, CodeTruth]:

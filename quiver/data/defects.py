@@ -103,7 +103,7 @@ def of_stream(stream: Stream) -> tuple[Array | None, Sensor]:
 
 def read_map(path: Path) -> Array:
     """Return a map of defective pixels, bool [H, W], from a .npy of booleans or of 0 and 1. `ValueError` otherwise."""
-    return check_map(files.load_array(path), str(path))
+    return check_map(np.asarray(files.load_array(path)), str(path))
 
 
 def check_map(array: Array, name: str) -> Array:

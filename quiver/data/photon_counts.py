@@ -109,7 +109,7 @@ def read_counts(path: Path) -> Counts:
 def _load(path: Path) -> Array:
     """Return the one array of a .npy or .npz."""
     if path.suffix == ".npy":
-        return load_array(path)
+        return np.asarray(load_array(path))
     with opening.opened(path) as opened, zipfile.ZipFile(opened) as archive:
         members = archive.infolist()
         if len(members) != 1:

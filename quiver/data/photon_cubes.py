@@ -11,6 +11,7 @@ from numpy import ndarray as Array
 from qsim.arrays import plain
 from qsim.checks import ArgumentError
 from qsim.files import load_array
+from qsim.lazy_array import LazyArray
 from qsim.plane_sums import AS_STORED, PlaneSums
 from qsim.sensor import devices
 from qsim.sensor.sensor import Sensor
@@ -45,7 +46,7 @@ def cube_codes(
 
 
 def _of_sums(
-    path: Path, array: Array, light: Illumination, frame_rate: float, sums: PlaneSums, width: int | None
+    path: Path, array: LazyArray, light: Illumination, frame_rate: float, sums: PlaneSums, width: int | None
 ) -> Codes:
     """Return the codes of a bare array that are sums of planes already; `ArgumentError` for packed planes."""
     if width is not None:
@@ -64,7 +65,7 @@ def _plane_of(light: Illumination, planes: int, exposure: float) -> Sensor:
     return light.but(bits=bits).device(exposure).plane
 
 
-def _check_planes(path: Path, array: Array) -> None:
+def _check_planes(path: Path, array: LazyArray) -> None:
     """Raise `ValueError` for an array of planes that may be packed."""
     if array.ndim == 3 and array.size and array.dtype == np.uint8 and array[0].max() > 1:
         raise ValueError(
@@ -73,7 +74,7 @@ def _check_planes(path: Path, array: Array) -> None:
         )
 
 
-def _unpacked(path: Path, cube: Array, sensor: Sensor, frame_rate: float, width: int) -> Codes:
+def _unpacked(path: Path, cube: LazyArray, sensor: Sensor, frame_rate: float, width: int) -> Codes:
     """Return packed planes, uint8 [T, H, ceil(W/8)], as codes of one bit that are unpacked when they are read."""
     if cube.ndim != 3 or cube.dtype != np.uint8 or cube.shape[2] != (width + 7) // 8 or 0 in cube.shape:
         raise ValueError(

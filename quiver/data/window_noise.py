@@ -17,7 +17,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.keys import Key
-from qsim.optics.radiometry import Crop
+from qsim.lazy_array import Crop
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip

@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
-from qsim.clip.lazy_array import LazyArray
+from qsim.lazy_array import LazyArray
 
 SHAPE = (9, 7, 5)
 

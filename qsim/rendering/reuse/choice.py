@@ -24,7 +24,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import clamped_squares
-from qsim.optics.radiometry import Crop
+from qsim.lazy_array import Crop
 from qsim.rendering.denoiser import Mixture, denoised, keeping_mean
 
 TILE = 8  # px, side of a tile

@@ -10,7 +10,7 @@ from PIL import Image, ImageSequence
 
 from qsim import colour
 from qsim.clip.film import MOST_FRAMES, Film, card
-from qsim.clip.lazy_array import LazyArray
+from qsim.lazy_array import LazyArray
 
 
 def decoded(html: str) -> list[np.ndarray]:
