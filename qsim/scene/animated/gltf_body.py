@@ -19,6 +19,7 @@ from msgspec import Meta
 from qsim import limits
 from qsim.kinds import Count, Number
 from qsim.records import convert
+from qsim.scene.animated.draco import unpacked
 from qsim.scene.animated.gltf_buffers import Accessor, Document, entries_of, open_document
 from qsim.scene.animated.gltf_materials import Paints
 from qsim.scene.animated.gltf_nodes import (
@@ -116,7 +117,7 @@ def animated_file(
     last pose. `carrier` moves the complete body. `FileNotFoundError` for a missing file or buffer, `ValueError` with
     the name of the file and the entry for one that is damaged, that has no animation, or whose skin is incomplete.
     """
-    document = open_document(Path(path))
+    document = unpacked(open_document(Path(path)))
     nodes = nodes_of(document)
     targets = {i: n for i, node in enumerate(nodes) if (n := target_count(document, node))}
     tracks = tracks_of(document, chosen_animation(document, animation), nodes, targets)
@@ -130,7 +131,7 @@ def still_pieces(path: str | Path) -> list[Piece]:
 
     Points and lines are left out. Faces have the order of `animated_file`. Errors as of `animated_file`.
     """
-    document = open_document(Path(path))
+    document = unpacked(open_document(Path(path)))
     pieces, joints = _read(document, nodes_of(document), {})
     raw = unscaled(pieces, joints)
     check_reach(document, raw)

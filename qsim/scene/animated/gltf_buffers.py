@@ -29,8 +29,12 @@ JSON_CHUNK = 0x4E4F534A
 BINARY_CHUNK = 0x004E4942
 TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-# What a file may require: these change materials or the type of numbers, which are read in any type.
-KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_punctual", "KHR_mesh_quantization")
+DRACO = "KHR_draco_mesh_compression"  # meshes that draco.py unpacks
+# What a file may require: these change materials, how meshes are stored, or the type of numbers: any type is read.
+KNOWN_EXTENSIONS = (
+    *("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_punctual", "KHR_mesh_quantization"),
+    DRACO,
+)
 
 Component = Literal[5120, 5121, 5122, 5123, 5125, 5126]  # the keys of TYPES
 Shape = Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT4"]  # the keys of NUMBERS

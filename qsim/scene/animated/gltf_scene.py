@@ -24,6 +24,7 @@ from qsim.optics.camera import Camera
 from qsim.optics.radiometry import RGB
 from qsim.records import convert
 from qsim.scene.animated.attached import Attached, inverse, placement, rigid_part
+from qsim.scene.animated.draco import unpacked
 from qsim.scene.animated.gltf_body import (
     FilePiece,
     check_reach,
@@ -33,7 +34,7 @@ from qsim.scene.animated.gltf_body import (
     target_count,
     unscaled,
 )
-from qsim.scene.animated.gltf_buffers import Document, open_document
+from qsim.scene.animated.gltf_buffers import DRACO, Document, open_document
 from qsim.scene.animated.gltf_materials import WEBP, Paints
 from qsim.scene.animated.gltf_nodes import (
     Node,
@@ -54,7 +55,7 @@ from qsim.scene.lights import Constant, Light
 from qsim.scene.scene import Body, Mesh, Scene
 
 INSTANCES = "EXT_mesh_gpu_instancing"
-UNDERSTOOD = (*MATERIALS, "KHR_texture_transform", WEBP, PUNCTUAL, "KHR_mesh_quantization", INSTANCES)
+UNDERSTOOD = (*MATERIALS, "KHR_texture_transform", WEBP, PUNCTUAL, "KHR_mesh_quantization", DRACO, INSTANCES)
 EVEN = 1e-6  # relative difference of lengths up to which a placement scales evenly
 
 
@@ -94,7 +95,7 @@ def read_gltf(
     perspective camera or a mesh, or one that requires an extension that is not read. A `UserWarning` names all that is
     left out.
     """
-    document = open_document(Path(path), UNDERSTOOD)
+    document = unpacked(open_document(Path(path), UNDERSTOOD))
     file = _File(document)
     played = file.played(animation)
     length = max((float(track.times[-1]) for track in played.values()), default=0.0)
