@@ -37,6 +37,7 @@ from qsim import kinds
 from qsim.checks import shown, suggest
 
 Made = TypeVar("Made")
+_ANY = "[...]"  # what msgspec says of a key of a dictionary
 _PLACE = re.compile(r" - at (?P<key>`key` in )?`\$(?P<path>[^`]*)`$")
 _LAYOUTS = ("DataclassInfo", "NamedTupleInfo", "TypedDictInfo")  # types of msgspec, which exports none of them
 _PART = re.compile(r"\.?(?P<name>[^.\[\]]+)|\[(?P<number>\d+|\.\.\.)\]")
@@ -256,8 +257,21 @@ def _told(problem: str, found: Any, kind: Any) -> str:
         return f"{before}{_misfit_key(*_at(path, kind, found))}"
     if not re.match(r"(Expected|Invalid|Number|Integer|Object)\b", text):
         return f"{before}{text}"  # of the record's own rules
+    path = _with_keys(path, kind, found)
     hint, value = _at(path, kind, found)
-    return f"{before}expected {words_of(hint)}, got {shown(value)}"
+    return f"{path.lstrip('.')}{': ' if path else ''}expected {words_of(hint)}, got {shown(value)}"
+
+
+def _with_keys(path: str, kind: Any, found: Any) -> str:
+    """Return a path of msgspec, which does not say which value of a dictionary does not fit, with its key."""
+    while _ANY in path:
+        before, _, after = path.partition(_ANY)
+        hint, values = _at(before, kind, found)
+        key = _first_misfit(hint, values)
+        if key is None:
+            return path
+        path = f"{before}.{key}{after}"
+    return path
 
 
 def _at(path: str, hint: Any, value: Any) -> tuple[Any, Any]:
@@ -265,9 +279,8 @@ def _at(path: str, hint: Any, value: Any) -> tuple[Any, Any]:
     for part in _PART.finditer(path):
         number = part["number"]
         if number is not None:
-            if number == "...":  # msgspec does not say which value of a dictionary
-                hint, value = _first_misfit(hint, value)
-                continue
+            if number == "...":  # no key is at fault
+                return hint, value
             value = value[int(number)]
             hint = _item_hint(hint, int(number))
             continue
@@ -276,15 +289,21 @@ def _at(path: str, hint: Any, value: Any) -> tuple[Any, Any]:
     return hint, value
 
 
-def _first_misfit(hint: Any, values: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return type and value of the first entry of a dictionary that does not fit."""
-    (kind,) = (get_args(bare_type(member))[1] for member in members_of(hint) if get_origin(bare_type(member)) is dict)
-    for value in values.values():
+def _first_misfit(hint: Any, values: Mapping[str, Any]) -> str | None:
+    """Return the key of the first value of a dictionary that does not fit; None if all do, and for a key with a dot."""
+    kind = _value_hint(hint)
+    for key, value in values.items():
         try:
             msgspec.convert(value, kind)
         except msgspec.ValidationError:
-            return kind, value
-    return hint, values
+            return key if re.fullmatch(r"\w+", key) else None
+    return None
+
+
+def _value_hint(hint: Any) -> Any:
+    """Return the type of the values of a dictionary; None for another type."""
+    dicts = [bare_type(member) for member in members_of(hint) if get_origin(bare_type(member)) is dict]
+    return get_args(dicts[0])[1] if dicts else None
 
 
 def _field_hint(hint: Any, name: str) -> Any:
@@ -295,7 +314,7 @@ def _field_hint(hint: Any, name: str) -> Any:
             return hints_of(bare)[name]
         if is_typeddict(bare):
             return get_type_hints(bare, include_extras=True)[name]
-    return Any
+    return _value_hint(hint) or Any
 
 
 def _misfit_key(hint: Any, values: Mapping[Any, Any]) -> str:

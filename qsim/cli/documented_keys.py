@@ -1,8 +1,7 @@
 """Lists the keys of recipes and sensor files: what each accepts, an example, and its meaning.
 
-Keys and what they accept come from the records that the files are read into. Those of a recipe are settings, which
-declare meanings and examples. Those of a sensor file come from the commented file in the docstring of the module that
-reads it, or from the comments of the fields.
+Keys and what they accept come from the records that the files are read into. They are settings, which declare meanings
+and examples; of the numbers of a sensor class the comments of its fields do.
 """
 
 from __future__ import annotations
@@ -15,32 +14,20 @@ import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from importlib import import_module
 from typing import Any, NamedTuple
 
 from qsim import records
 from qsim.dataset import recipe_file
 from qsim.rendering.render_settings import RenderSettings
+from qsim.sensor.colour_filter import ColourKeys
+from qsim.sensor.defects.defect_table import DefectKeys
+from qsim.sensor.file_laws import SensorKeys
 from qsim.settings import Setting, settings_of
 from qsim.streams.sensing import Sensing
 from qsim.tables import text_table
 
-
-class Section(NamedTuple):
-    """Where the keys of a section of a sensor file are described."""
-
-    commented_in: str  # a module whose docstring shows the section as a commented file
-    checked_in: str = ""
-    name: str = ""  # of the record; "": none, the commented lines are the keys
-
-
-_DEFECTS = "qsim.sensor.defects.defect_table"
-SENSOR_FILE = {
-    "[sensor]": Section("qsim.sensor.file_laws", "qsim.sensor.file_laws", "Laws"),
-    "[sources]": Section("qsim.sensor.file_laws"),
-    "[defects]": Section(_DEFECTS, _DEFECTS, "DefectKeys"),
-    "[colour]": Section("qsim.sensor.colour_filter"),
-}
+SENSOR_FILE: dict[str, Any] = {"[sensor]": SensorKeys, "[defects]": DefectKeys, "[colour]": ColourKeys}
+SOURCES = "[sources]"
 RECIPE = tuple(recipe_file.SECTIONS)
 
 
@@ -89,18 +76,28 @@ def _example(one: Setting) -> Any:
 
 
 def sensor_keys(section: str) -> list[Key]:
-    """Return the keys of a section of a sensor file; `ValueError` where Python removed the docstrings."""
-    where = SENSOR_FILE[section]
-    text = import_module(where.commented_in).__doc__
-    if text is None:
-        raise ValueError("the keys are described in docstrings, which python -OO removes; run without -OO")
-    examples = commented(text, section)
-    if not where.name:
-        return [Key(name, False, "", *found) for name, found in examples.items()]
-    record = getattr(import_module(where.checked_in), where.name)
-    found = [Key(name, needed, accepts, *examples[name]) for name, needed, accepts in flat(record)]
-    known = {"model", *(key.name for key in found)}
-    return found + [Key(name, False, "", *more) for name, more in examples.items() if name not in known]  # by others
+    """Return the keys of a section of a sensor file, in the order of its record: what their settings declare."""
+    if section == SOURCES:
+        meaning = "where the number of this key of [sensor] comes from; one line per key"
+        return [Key("median", False, "a text", '"data sheet, page 3"', meaning)]
+    return list(_keys_of(SENSOR_FILE[section]))
+
+
+def _keys_of(record: Any, above: str = "") -> Iterator[Key]:
+    """Yield the keys of a record and of the records in it; one for each example of a table of equal entries."""
+    declared = {one.name: one for one in settings_of(record)}
+    for field in dataclasses.fields(record):
+        if (one := declared.get(field.name)) is None:
+            (inner,) = (
+                m for m in records.members_of(records.hints_of(record)[field.name]) if dataclasses.is_dataclass(m)
+            )
+            yield from _keys_of(inner, f"{above}{field.name}.")
+            continue
+        example = one.default if one.example is None else one.example
+        each = example.items() if isinstance(example, dict) else [("", example)]
+        for name, value in each:
+            full = f"{above}{one.name}.{name}".rstrip(".")
+            yield Key(full, one.required, one.expected, json.dumps(value), one.help_with_default)
 
 
 def flat(record: Any, above: str = "") -> Iterator[tuple[str, bool, str]]:
@@ -113,24 +110,6 @@ def flat(record: Any, above: str = "") -> Iterator[tuple[str, bool, str]]:
         else:
             needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
             yield above + field.name, needed, records.words_of(hints[field.name])
-
-
-def commented(text: str, section: str) -> dict[str, tuple[str, str]]:
-    """Return {key: (example, meaning)} of a section of a commented TOML file; a meaning may continue below."""
-    found: dict[str, tuple[str, str]] = {}
-    last = ""
-    for line in text.partition(f"    {section}")[2].splitlines()[1:]:
-        if re.match(r"    \[|\S", line):
-            break
-        if entry := re.match(r"    ([\w.]+) = (.*?)\s+# (.*)", line):
-            last = entry[1]
-            found[last] = (entry[2], entry[3])
-        elif last and (more := re.match(r"\s{8,}# (.*)", line)):
-            example, meaning = found[last]
-            found[last] = (example, f"{meaning} {more[1]}")
-        else:
-            last = ""
-    return found
 
 
 # ---- Fields of sensors
@@ -194,9 +173,8 @@ def of_sensor_files() -> dict[str, list[Key]]:
     from qsim.sensor.devices import MODELS
 
     models = {f"[sensor] of a {model}": model_keys(model) for model in MODELS}
-    shared = {section: keys(section) for section in SENSOR_FILE}
-    laws = shared.pop("[sensor]")
-    return models | {"[sensor] of any model, laws": laws} | shared
+    laws = {"[sensor] of any model, laws": keys("[sensor]"), SOURCES: keys(SOURCES)}
+    return models | laws | {section: keys(section) for section in SENSOR_FILE if section != "[sensor]"}
 
 
 def lines(sections: Mapping[str, Iterable[Key]]) -> list[str]:

@@ -10,41 +10,20 @@ from __future__ import annotations
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import msgspec
-from msgspec import Meta
 
 from qsim import files, records
 from qsim.dataset.recipe_file import RecipeFile
-from qsim.kinds import Positive, Text
-from qsim.sensor.colour_filter import MASKS
+from qsim.kinds import Text
+from qsim.sensor.colour_filter import ColourKeys
 from qsim.sensor.defects.defect_table import DefectKeys
 from qsim.sensor.devices import MODELS
-from qsim.sensor.file_laws import Laws
+from qsim.sensor.file_laws import SensorKeys
 
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _NULL = {"type": "null"}
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SensorKeys(Laws):
-    """The keys of [sensor] of any model: laws of the file."""
-
-    iso: Annotated[Positive | None, Meta(description="QIS: gain = iso / 100 (2^bits - 1 - offset) / full_well")] = None
-
-
-Mask = Annotated[str | list[str], Meta(description=f"{', '.join(MASKS)}, or rows of letters")]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ColourKeys:
-    """The table [colour]: colour filters."""
-
-    mask: Mask
-    efficiency: Annotated[
-        dict[str, float | tuple[float, float, float]] | None, Meta(description="of a colour, for photons of R, G and B")
-    ] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

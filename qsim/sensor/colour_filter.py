@@ -5,15 +5,8 @@
 A pixel of colour c collects sum_b efficiency[c][b] photons_b + dark electrons. That is what a sensor without filters
 collects of sum_b (efficiency[c][b] / efficiency) photons_b: its exact law, its keys and its engines draw every mosaic.
 
-    # my_sensor.toml, below [sensor]
-    [colour]
-    mask = "rggb"                      # or another of MASKS, or rows of a tile: ["RG", "GB"]
-    efficiency.R = 0.45                # of red photons; or of R, G and B photons: [0.45, 0.04, 0.01]
-    efficiency.G = 0.60                # of green photons, likewise
-    efficiency.B = 0.50                # of blue photons, likewise
-    efficiency.W = [0.70, 0.75, 0.60]  # of a colour that is none of R, G and B
-
-Without `efficiency` a filter passes all light of its band, and W of all bands, to the efficiency of the sensor.
+`ColourKeys` declares the keys of a table [colour]. Without `efficiency` a filter passes all light of its band, and W of
+all bands, to the efficiency of the sensor.
 """
 
 from __future__ import annotations
@@ -21,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -29,6 +22,8 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.checks import suggest
 from qsim.host import own_numbers
+from qsim.records import convert
+from qsim.settings import setting
 
 BANDS = "RGB"
 MASKS = {
@@ -39,7 +34,30 @@ MASKS = {
     "green": ("G",),
     "blue": ("B",),
 }
-Efficiency = tuple[float, float, float]  # electrons or avalanches per photon of R, G and B
+# Electrons or avalanches per photon of R, G and B. Without bounds, which `ColourFilter` checks: msgspec 0.22 reads a
+# bound of a number beside a tuple of three from another place in memory.
+Efficiency = tuple[float, float, float]
+
+
+_MASK = f'one of {", ".join(MASKS)}, or rows of a tile of letters: ["RG", "GB"]'
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColourKeys:
+    """The keys of a table [colour]."""
+
+    mask: Annotated[
+        str | tuple[str, ...],
+        setting(_MASK, example="rggb"),
+    ]
+    efficiency: Annotated[
+        dict[str, float | Efficiency] | None,
+        setting(
+            "of the filters of a colour: for photons of its band, or for those of R, G and B",
+            unset="that of the sensor",
+            example={"R": 0.45, "G": 0.60, "B": 0.50, "W": [0.70, 0.75, 0.60]},
+        ),
+    ] = None
 
 
 @own_numbers
@@ -150,35 +168,24 @@ def from_toml(path: str | Path) -> ColourFilter | None:
 def from_dict(table: Any, where: str = "colour") -> ColourFilter:
     """Return the array of a table, or of the output of `to_dict`; strict, `ValueError`."""
     if not isinstance(table, Mapping) or "mask" not in table:
-        raise ValueError(f'{where}: a table with mask = "rggb" is needed, got {table!r}')
-    for key in table:
-        if key not in ("mask", "efficiency"):
-            raise ValueError(f"{where}: unknown key {key!r}{suggest(key, ('mask', 'efficiency'))}")
-    mask = table["mask"]
-    given = table.get("efficiency")
-    if isinstance(mask, str):
-        if mask not in MASKS:
-            raise ValueError(f"{where}: mask is one of {', '.join(MASKS)} or rows of letters, got {mask!r}")
-        mask = MASKS[mask]
-    if not (isinstance(mask, list | tuple) and all(isinstance(row, str) for row in mask)):
-        raise ValueError(f"{where}: mask is one of {', '.join(MASKS)} or rows of letters, got {mask!r}")
-    if given is not None and not isinstance(given, Mapping):
-        raise ValueError(f"{where}: efficiency is a table, as in efficiency.R = 0.5, got {given!r}")
-    efficiency = None if given is None else {key: _per_band(key, value, where) for key, value in given.items()}
+        raise ValueError(f'{where}: a table with mask = "rggb" is needed, got {table!r:.200}')
+    keys = convert(table, ColourKeys, where)
+    if isinstance(keys.mask, str) and keys.mask not in MASKS:
+        raise ValueError(f"{where}: mask is one of {', '.join(MASKS)} or rows of letters, got {keys.mask!r:.200}")
+    mask = MASKS[keys.mask] if isinstance(keys.mask, str) else keys.mask
+    given = keys.efficiency
+    efficiency = None if given is None else {name: _per_band(name, value, where) for name, value in given.items()}
     try:
-        return ColourFilter(tuple(mask), efficiency)
+        return ColourFilter(mask, efficiency)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 
 
-def _per_band(colour: str, value: Any, where: str) -> Efficiency:
+def _per_band(colour: str, value: float | Efficiency, where: str) -> Efficiency:
     """Return the efficiency of a colour for each band, from a number (its own band) or three."""
-    values = value if isinstance(value, list) else [value]
-    right = len(values) == 3 or (len(values) == 1 and colour in BANDS)
-    if not right or not all(type(each) in (int, float) for each in values):
-        wanted = "a number from 0 to 1, or three" if colour in BANDS else "three numbers from 0 to 1"
-        raise ValueError(f"{where}: efficiency.{colour}: {wanted} (for photons of R, G and B), got {value!r}")
-    if len(values) == 1:
-        values = [values[0] * (band == colour) for band in BANDS]
-    red, green, blue = (float(each) for each in values)
+    if isinstance(value, tuple):
+        return value
+    if colour not in BANDS:
+        raise ValueError(f"{where}: efficiency.{colour}: three numbers are needed, for photons of R, G and B")
+    red, green, blue = (float(value) * (band == colour) for band in BANDS)
     return red, green, blue

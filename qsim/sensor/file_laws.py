@@ -1,23 +1,12 @@
 """Reads the laws of a sensor file: a median dark rate, dark counts over temperature, efficiency over wavelength.
 
-    # my_sensor.toml; each line is optional, and a missing one changes no bit
-    [sensor]
-    model = "BinarySPAD"
-    median = 0.4                   # 1/s, dark rate of the median pixel, in place of the mean (dark_count_rate)
-    dark_doubling = 8.0            # K: the dark rate doubles per so many kelvin
-    dark_reference = 25.0          # degrees C at which the dark rate is stated
-    temperature = 40.0             # degrees C of the sensor; default: dark_reference
-    qe_curve = [[450e-9, 0.30], [550e-9, 0.50], [650e-9, 0.35]]  # m, efficiency, in place of pde
-    iso = 100                      # QIS: gain = iso / 100 (2^bits - 1 - offset) / full_well, in place of gain
-
-    [sources]
-    median = "data sheet, page 3"  # where the number of this key of [sensor] comes from; one line per key
-
+    [sensor] of a file --resolved--> the same without laws, as a sensor class takes it
     dark rate = stated rate * 2^((temperature - dark_reference) / dark_doubling)
 
-They are laws of the file: the sensor that comes out of them has one dark rate and one efficiency. A clip of one band
-has one wavelength, that of its camera; the bands of a colour clip have one each, and each light is taken at that
-wavelength alone. Between the points of a curve the efficiency is linear.
+`SensorKeys` declares the keys; each is optional, and a missing one changes no bit. They are laws of the file: the
+sensor that comes out of them has one dark rate and one efficiency. A clip of one band has one wavelength, that of its
+camera; the bands of a colour clip have one each, and each light is taken at that wavelength alone. Between the points
+of a curve the efficiency is linear.
 """
 
 from __future__ import annotations
@@ -30,9 +19,10 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
-from qsim.kinds import NotNegative
+from qsim.kinds import NotNegative, Positive
 from qsim.records import convert
 from qsim.sensor.defects.fixed_pattern import DarkSpread
+from qsim.settings import setting
 
 DARK = {"QIS": "dark_current", "SpikeCamera": "dark_current"}  # of other models: dark_count_rate
 EFFICIENCY = {"QIS": "quantum_efficiency", "SpikeCamera": "quantum_efficiency"}  # of other models: pde
@@ -51,15 +41,36 @@ class Laws:
     """The keys of [sensor] that are laws of the file."""
 
     median: Annotated[
-        NotNegative | None, Meta(description="1/s, dark rate of the median pixel, in place of the mean")
+        NotNegative | None,
+        setting("dark rate of the median pixel, in place of the mean (dark_count_rate)", unit="1/s", example=0.4),
     ] = None
     dark_doubling: Annotated[
-        Annotated[float, Meta(ge=0.1, le=1e12)] | None, Meta(description="K: the dark rate doubles per so many kelvin")
+        Annotated[float, Meta(ge=0.1, le=1e12)] | None,
+        setting("the dark rate doubles per so many kelvin", unit="K", example=8.0),
     ] = None
-    dark_reference: Annotated[Celsius | None, Meta(description="degrees C at which the dark rate is stated")] = None
-    temperature: Annotated[Celsius | None, Meta(description="degrees C of the sensor; default: dark_reference")] = None
+    dark_reference: Annotated[
+        Celsius | None, setting("temperature at which the dark rate is stated", unit="degrees C", example=25.0)
+    ] = None
+    temperature: Annotated[
+        Celsius | None,
+        setting("temperature of the sensor", unit="degrees C", unset="dark_reference", example=40.0),
+    ] = None
     qe_curve: Annotated[
-        Curve | None, Meta(description="[[wavelength in m, efficiency], ...], in place of the efficiency")
+        Curve | None,
+        setting(
+            "points (wavelength in m, efficiency) of a curve, in place of the efficiency",
+            example=[[450e-9, 0.30], [550e-9, 0.50], [650e-9, 0.35]],
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorKeys(Laws):
+    """The keys of [sensor] of any model: laws of the file."""
+
+    iso: Annotated[
+        Positive | None,
+        setting("QIS: gain = iso / 100 (2^bits - 1 - offset) / full_well, in place of gain", example=100),
     ] = None
 
 

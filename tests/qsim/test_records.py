@@ -75,7 +75,7 @@ REFUSED = {
     "shares: expected a list of 1 to 256: a number from 1e-06 to 1, got []": {"shares": []},
     "several[1].delay: expected a number above 0, got -1": {"several": [{"delay": 1}, {"delay": -1}]},
     "unknown key 'several[0].dela' (did you mean 'delay'?)": {"several": [{"dela": 1}]},
-    "named[...].delay: expected a number above 0, got -1": {"named": {"a": {"delay": 1}, "b": {"delay": -1}}},
+    "named.b.delay: expected a number above 0, got -1": {"named": {"a": {"delay": 1}, "b": {"delay": -1}}},
     "unknown key 'named.a.dela' (did you mean 'delay'?)": {"named": {"a": {"dela": 1}}},
     "place: expected a list of 2: a whole number from 0, got [1]": {"place": [1]},
     "expected a table of values, got [1]": [1],

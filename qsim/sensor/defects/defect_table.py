@@ -1,31 +1,10 @@
 """Reads the [defects] table of a sensor file, and writes it beside streams. All defects are off by default.
 
-    # my_sensor.toml, below [sensor]; every line is optional, and a missing one changes no bit
-    [defects]
-    device_seed = 7                # which device of its kind: the fixed pattern is a function of it; default 0
-    prnu = 0.01                    # relative standard deviation of the efficiency
-    dark.spread = 0.18             # of the dark rate: standard deviation of the logarithm, without hot pixels
-    dark.hot_share = 0.022         # share of hot pixels
-    dark.hot_from = 3.0            # lowest rate of a hot pixel, in medians of the dark rate
-    dark.hot_to = 400.0            # highest rate of a hot pixel, in medians of the dark rate
-    dark.tail = 0.67               # the share of pixels above a rate falls as rate^-tail between hot_from and hot_to
-    dead = 0.001                   # share of pixels that never fire
-    offset = 0.2                   # QIS: codes rms (with `dark`: the dark signal non-uniformity)
-    read_noise = 0.1               # QIS: relative standard deviation of the read noise
-    dark_map = "my_dark.npy"       # dark rates [H, W] in 1/s, beside this file; their mean replaces the sensor's
-    gain_map = "my_gain.npy"       # efficiency over the sensor's [H, W]
-    dead_map = "my_bad.npy"        # true where a pixel never fires [H, W]
-    offset_map = "my_offset.npy"   # QIS: codes [H, W]
-    read_noise_map = "my_rn.npy"   # QIS: e- rms [H, W]
-    crosstalk = 0.001              # per neighbour: chance that an avalanche sets off one given of the four; data sheets
-                                   # often give the total, here 1 - (1 - 0.001)^4 = 0.004 for any of them
-    afterpulse = 0.01              # clocked: chance of a detection caused by one in the plane before
-    afterpulse_delay = 2e-8        # counting: s, mean delay of the afterpulse of a count
-    carry_dead_time = true         # counting: a dead time continues in the next exposure
+    [defects] of a file --from_toml--> Defects --to_dict--> the table beside a stream
 
-Counting pixels whose light changes inside the exposure, whose dead time is carried over, or that afterpulse are
-followed photon by photon (event_simulation.py) if the largest of these effects exceeds its TOLERANCE; otherwise the
-closed form draws.
+`DefectKeys` declares the keys; each is optional, and a missing one changes no bit. Counting pixels whose light changes
+inside the exposure, whose dead time is carried over, or that afterpulse are followed photon by photon
+(event_simulation.py) if the largest of these effects exceeds its TOLERANCE; otherwise the closed form draws.
 """
 
 from __future__ import annotations
@@ -33,12 +12,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Annotated, Any, NotRequired, TypedDict
 
 from qsim import files, limits
 from qsim.kinds import Digest, NotNegative
 from qsim.records import convert
 from qsim.sensor.defects.fixed_pattern import FixedPattern
+from qsim.settings import setting
 
 _MAPS = {
     "gain_map": "prnu",
@@ -58,19 +38,41 @@ class MapFile(TypedDict):
     sha256: NotRequired[Digest]
 
 
+Map = str | MapFile | None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Disturbances:
     """The keys of [defects] beside those of the fixed pattern."""
 
-    gain_map: str | MapFile | None = None
-    dark_map: str | MapFile | None = None
-    dead_map: str | MapFile | None = None
-    offset_map: str | MapFile | None = None
-    read_noise_map: str | MapFile | None = None
-    crosstalk: NotNegative = 0.0
-    afterpulse: NotNegative = 0.0
-    afterpulse_delay: NotNegative = 0.0  # s
-    carry_dead_time: bool = False
+    gain_map: Annotated[Map, setting("efficiency over the sensor's [H, W]", example="my_gain.npy")] = None
+    dark_map: Annotated[
+        Map,
+        setting(
+            "dark rates [H, W], beside this file; their mean replaces the sensor's", unit="1/s", example="my_dark.npy"
+        ),
+    ] = None
+    dead_map: Annotated[Map, setting("true where a pixel never fires [H, W]", example="my_bad.npy")] = None
+    offset_map: Annotated[Map, setting("QIS: codes [H, W]", example="my_offset.npy")] = None
+    read_noise_map: Annotated[Map, setting("QIS: read noise [H, W]", unit="e- rms", example="my_rn.npy")] = None
+    crosstalk: Annotated[
+        NotNegative,
+        setting(
+            "per neighbour: chance that an avalanche sets off one given of the four; data sheets often give the total, "
+            "here 1 - (1 - 0.001)^4 = 0.004 for any of them",
+            example=0.001,
+        ),
+    ] = 0.0
+    afterpulse: Annotated[
+        NotNegative,
+        setting("clocked: chance of a detection caused by one in the plane before", example=0.01),
+    ] = 0.0
+    afterpulse_delay: Annotated[
+        NotNegative, setting("counting: mean delay of the afterpulse of a count", unit="s", example=2e-8)
+    ] = 0.0
+    carry_dead_time: Annotated[bool, setting("counting: a dead time continues in the next exposure", example=True)] = (
+        False
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,6 +11,7 @@ one. Maps of read noise and offset change the ADC; their codes are drawn step by
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy import ndarray as Array
@@ -19,6 +20,7 @@ from qsim.keys import Key, hash_name, uniform, words
 from qsim.sensor.distribution import require_number
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
+from qsim.settings import setting
 
 _DEVICE = hash_name("qsim fixed pattern")  # the "clip" of all device maps
 
@@ -31,11 +33,15 @@ class DarkSpread:
     Poisson in the body, 2.2 % of pixels above 3 medians, 1.0 % above 10, the hottest at 370.
     """
 
-    spread: float = 0.18  # standard deviation of the logarithm, of the body
-    hot_share: float = 0.022  # of all pixels
-    hot_from: float = 3.0  # medians
-    hot_to: float = 400.0  # medians
-    tail: float = 0.67  # P(rate > x) falls as x^-tail between hot_from and hot_to
+    spread: Annotated[float, setting("of the dark rate: standard deviation of the logarithm, without hot pixels")] = (
+        0.18
+    )
+    hot_share: Annotated[float, setting("share of hot pixels")] = 0.022
+    hot_from: Annotated[float, setting("lowest rate of a hot pixel, in medians of the dark rate")] = 3.0
+    hot_to: Annotated[float, setting("highest rate of a hot pixel, in medians of the dark rate")] = 400.0
+    tail: Annotated[
+        float, setting("the share of pixels above a rate falls as rate^-tail between hot_from and hot_to")
+    ] = 0.67
 
     def __post_init__(self) -> None:
         require_number(self, "spread", 0)
@@ -69,12 +75,14 @@ class DarkSpread:
 class FixedPattern:
     """The strengths of the fixed-pattern noise of a device; `draw_maps` draws its maps."""
 
-    device_seed: int = 0
-    prnu: float = 0.0  # relative standard deviation of the efficiency
+    device_seed: Annotated[
+        int, setting("which device of its kind: the fixed pattern is a function of it", example=7)
+    ] = 0
+    prnu: Annotated[float, setting("relative standard deviation of the efficiency", example=0.01)] = 0.0
     dark: DarkSpread | None = None  # of the dark rate
-    dead: float = 0.0  # share of pixels that never fire; placed independently
-    offset: float = 0.0  # codes rms, QIS (with `dark`, the dark signal non-uniformity)
-    read_noise: float = 0.0  # relative standard deviation of the read noise, QIS
+    dead: Annotated[float, setting("share of pixels that never fire, placed independently", example=0.001)] = 0.0
+    offset: Annotated[float, setting("QIS: codes rms (with `dark`: the dark signal non-uniformity)", example=0.2)] = 0.0
+    read_noise: Annotated[float, setting("QIS: relative standard deviation of the read noise", example=0.1)] = 0.0
 
     def __post_init__(self) -> None:
         require_number(self, "prnu", 0, 1)

@@ -42,20 +42,7 @@ def test_every_key_of_a_sensor_file_is_printed(capsys):
     assert set(found["[colour]"]) == {"mask", *(f"efficiency.{colour}" for colour in "RGBW")}
     meanings = [row["meaning"] for rows in found.values() for row in rows.values() if row["name"] != "bits"]
     assert all(meanings)
-    assert found["[defects]"]["crosstalk"]["meaning"].endswith("for any of them")
-
-
-def test_a_meaning_ends_where_its_comment_ends():
-    text = (
-        "    [a]\n    one = 1    # first\n               # and more\n    # a remark\n    two = 2    # second\n    [b]\n"
-    )
-    assert documented_keys.commented(text, "[a]") == {"one": ("1", "first and more"), "two": ("2", "second")}
-
-
-def test_without_docstrings_the_reason_is_named(monkeypatch, capsys):
-    monkeypatch.setattr(file_laws, "__doc__", None)
-    assert main(["sensors", "--keys"]) == 2
-    assert "run without -OO" in capsys.readouterr().err
+    assert found["[defects]"]["crosstalk"]["meaning"].endswith("for any of them (default 0)")
 
 
 @pytest.mark.parametrize("name", list(devices.DEVICES))

@@ -120,10 +120,11 @@ MISTAKES = [
     ({"mask": ["RC"]}, r"colour C of the mask has none; give efficiency\.C"),
     ({"mask": "rggb", "efficiency": {"R": 0.5, "G": 0.5}}, r"colour B of the mask has none; give efficiency\.B"),
     ({"mask": ["R"], "efficiency": {"R": 0.5, "W": [1, 1, 1]}}, r"efficiency\.W: the mask has no such colour"),
-    ({"mask": ["W"], "efficiency": {"W": 0.5}}, r"efficiency\.W: three numbers from 0 to 1"),
+    ({"mask": ["W"], "efficiency": {"W": 0.5}}, r"efficiency\.W: three numbers are needed, for photons of R, G and B"),
     ({"mask": ["R"], "efficiency": {"R": 1.5}}, "three numbers from 0 to 1, one above 0"),
     ({"mask": ["R"], "efficiency": {"R": 0.0}}, "three numbers from 0 to 1, one above 0"),
-    ({"mask": ["R"], "efficiency": 0.5}, "efficiency is a table"),
+    ({"mask": ["R"], "efficiency": 0.5}, "efficiency: expected a table of values, got 0.5"),
+    ({"mask": ["R"], "efficiency": {"R": [0.5, 0.1]}}, r"efficiency\.R: expected a number, or a list of"),
     ({"mask": ["R"], "masks": 1}, "unknown key 'masks'"),
     ({"tile": 1}, "a table with mask"),
 ]

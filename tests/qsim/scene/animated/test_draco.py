@@ -80,7 +80,9 @@ def test_what_does_not_fit_is_refused(tmp_path):
     refused(r"bufferViews\[7\]|bufferViews; there|names bufferViews", bufferView=7)
     refused(r"states 80 of 'VEC3'", lambda content: content["accessors"][0].update(count=80))
     refused(r"an accessor states 1000000000 vertices", lambda content: content["accessors"][0].update(count=10**9))
-    refused("its data are no mesh of Draco", lambda content: content["bufferViews"][0].update(byteOffset=1, byteLength=60))
+    refused(
+        "its data are no mesh of Draco", lambda content: content["bufferViews"][0].update(byteOffset=1, byteLength=60)
+    )
 
 
 def test_damaged_data_are_read_or_refused(tmp_path):
