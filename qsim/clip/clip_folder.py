@@ -208,6 +208,10 @@ class ClipFolder:
         """Return whether the ground truth has a channel: u and v of flow, bu and bv of flow_back, valid, Z, id."""
         return self.has_truth and channel in self._channels("truth", 0)
 
+    def channels_of_truth(self, t: int) -> frozenset[str]:
+        """Return the channels of the ground truth of frame t, as `holds` names them."""
+        return frozenset(self._channels("truth", t))
+
     def _half(self, folder: str, t: int, crop: Crop | None) -> Array:
         """Return an image of frame t in a folder, float32 [h, w] or [3, h, w]."""
         self._check_frame(t)

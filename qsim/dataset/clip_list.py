@@ -11,7 +11,7 @@ from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, overload
+from typing import Any, Protocol, overload
 
 import numpy as np
 from numpy import ndarray as Array
@@ -111,10 +111,34 @@ class ListedClips:
         return [(clip.name, clip.info.checksums) for clip in self.clips]
 
 
+class Part(Protocol):
+    """Clips from one source, opened when they are asked for."""
+
+    def __len__(self) -> int: ...
+
+    def clip(self, position: int) -> Clip:
+        """Open a clip."""
+
+    def paths(self, positions: Iterable[int]) -> list[Path]:
+        """Return folders of clips."""
+
+    def alike(self) -> Sequence[int]:
+        """Return the positions of the clips that stand for all."""
+
+    def without(self, folders: set[Path]) -> Part:
+        """Return these clips but those in some resolved folders."""
+
+    def part(self, positions: range) -> Part:
+        """Return some of these clips."""
+
+    def digest(self) -> Any:
+        """Return what tells these clips from others."""
+
+
 class ClipList(Sequence[Clip]):
     """Clips of data sets and others, one after another."""
 
-    def __init__(self, parts: Sequence[ClipsOfDataset | ListedClips]) -> None:
+    def __init__(self, parts: Sequence[Part]) -> None:
         self.parts = tuple(parts)
         self._starts = [0, *itertools.accumulate(map(len, self.parts))]
 
@@ -140,7 +164,7 @@ class ClipList(Sequence[Clip]):
         number = bisect_right(self._starts, position) - 1
         return self.parts[number].clip(position - self._starts[number])
 
-    def _inside(self, positions: range) -> Iterator[tuple[ClipsOfDataset | ListedClips, range]]:
+    def _inside(self, positions: range) -> Iterator[tuple[Part, range]]:
         """Yield each part with the positions that ascending `positions` of the whole list take of it."""
         for part, start in zip(self.parts, self._starts, strict=False):
             first = max(0, -(-(start - positions.start) // positions.step))
@@ -162,6 +186,11 @@ class ClipList(Sequence[Clip]):
     def alike(self) -> list[Clip]:
         """Return the clips that stand for all: the first of each series, and those that are listed by themselves."""
         return [part.clip(position) for part in self.parts for position in part.alike()]
+
+    def alike_positions(self) -> list[int]:
+        """Return the positions of the clips that stand for all."""
+        starts = zip(self.parts, self._starts, strict=False)
+        return [start + position for part, start in starts for position in part.alike()]
 
     def without(self, others: ClipList) -> ClipList:
         """Return these clips but those of `others`; the splits of one data set have none in common."""

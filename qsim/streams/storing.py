@@ -92,10 +92,8 @@ def sense(
     A stream of this name is kept if its settings are the same; `FileExistsError` for other settings without `force`.
     While another process senses this clip, wait after a call of `on_wait`.
     """
-    if isinstance(sensing.sensor, Sensor):
-        devices.check_known(sensing.sensor)
-    draw, missed = followed(clip, sensing, prepare(clip, sensing))
-    info = dataclasses.replace(describe(clip, sensing, draw), dead_time_effects=missed)
+    draw, info = _described(clip, sensing)
+    missed = info.dead_time_effects
     efficiency = draw.sensor.efficiency
     whole = dataclasses.replace(draw.level, ppp=draw.level.ppp * draw.planes)  # of a code, not of a clip frame
     line = light_line(whole, efficiency, draw.colour, clip.bands)
@@ -120,6 +118,24 @@ def sense(
             return kept, line
         blocks = draw.packed(clip, info.shape[0], progress)
         return _write(clip, sensing.stream_name, blocks, info), line
+
+
+@own_numbers
+def drawn(clip: ClipFolder, sensing: Sensing) -> tuple[StreamInfo, Draw, Callable[[], Iterator[Array]]]:
+    """Return the description of a stream, its draw, and what yields its packed codes; nothing is stored.
+
+    They are those that `sense` stores: uint8 [t, H, ceil(W bits / 8)], some frames at a time.
+    """
+    draw, info = _described(clip, sensing)
+    return info, draw, lambda: draw.packed(clip, info.shape[0])
+
+
+def _described(clip: ClipFolder, sensing: Sensing) -> tuple[Draw, StreamInfo]:
+    """Return the draw of a `Sensing` of a clip, and the description of its stream."""
+    if isinstance(sensing.sensor, Sensor):
+        devices.check_known(sensing.sensor)
+    draw, missed = followed(clip, sensing, prepare(clip, sensing))
+    return draw, dataclasses.replace(describe(clip, sensing, draw), dead_time_effects=missed)
 
 
 def _kept(clip: ClipFolder, sensing: Sensing, info: StreamInfo) -> Stream | None:
