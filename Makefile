@@ -4,7 +4,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS := llvm,networks,cluster,denoise,video,formats,tiff,tcspc,draco,docs,dev
+EXTRAS := llvm,networks,cluster,denoise,video,formats,publish,s3,tiff,tcspc,draco,docs,dev
 # One thread per test process: two processes share two cores.
 TEST_ENV := OMP_NUM_THREADS=1 PYTHONWARNINGS=error::SyntaxWarning
 

@@ -156,7 +156,7 @@ def _kinds(run: Callable[..., int]) -> list[_Kind]:
 
     `Record` is one record, `tuple[Record, ...]` one for each combination of varied settings; `Annotated` with a
     dictionary states defaults of the command. `Annotated[dict[str, Any], Record, names]` holds those of the record's
-    settings that are given.
+    settings that are given; a dictionary after them states defaults, too.
     """
     hints = get_type_hints(run, include_extras=True)
     found = []
@@ -167,7 +167,9 @@ def _kinds(run: Callable[..., int]) -> list[_Kind]:
             hint, *rest = get_args(hint)
             notes = tuple(rest)
         if get_origin(hint) is dict:
-            found.append(_Kind(notes[0], bare=True, names=notes[1:]))
+            names = tuple(note for note in notes[1:] if isinstance(note, str))
+            stated = next((note for note in notes[1:] if isinstance(note, Mapping)), {})
+            found.append(_Kind(notes[0], bare=True, names=names, defaults=stated))
             continue
         several = get_origin(hint) is tuple
         record = get_args(hint)[0] if several else hint

@@ -44,6 +44,8 @@ OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
     ),
     "video": (("av",), "video files: qsim convert, qsim preview"),
     "formats": (("zarr", "h5py"), "Zarr and HDF5 files: qsim convert, qsim calibrate"),
+    "publish": (("pyarrow", "fsspec"), "qsim publish: Parquet, and addresses as s3://"),
+    "s3": (("s3fs",), "published sets at s3://"),
     "tiff": (("imagecodecs",), "compressed TIFF (LZW, CCITT, zstd) and 12-bit TIFF: qsim convert"),
     "tcspc": (("ptufile", "sdtfile"), "photon counts of PTU and SDT files: qsim convert"),
     "cluster": (("distributed",), "qsim generate --cluster"),

@@ -30,6 +30,10 @@ PROGRAM = Program(
             "Render one small job of each kind and print the forecast of a recipe's cost.",
         ),
         "check": ("qsim.cli.dataset:check", "Compare files with their checksums; exit code 1 if one is damaged."),
+        "publish": (
+            "qsim.cli.publish:publish",
+            "Write a data set as WebDataset, Parquet, HDF5 or zarr, with a data card; to a folder or s3://.",
+        ),
         "recipes": ("qsim.cli.dataset:recipes", "List the shipped recipes and what each one makes, or print one."),
         "sensors": ("qsim.cli.dataset:sensors", "List the named sensors, or the keys of a sensor file."),
         "convert": ("qsim.cli.convert:convert", "Read foreign recordings as clips or streams; write ours for others."),

@@ -10,6 +10,7 @@ from qsim.dataset.clip_list import ClipList
 from qsim.dataset.dataset import Dataset
 from qsim.files import sha256, to_json
 from qsim.optics.radiometry import WHITE_PER_MEAN
+from qsim.publishing.published_set import PublishedSet, is_published
 from qsim.streams.clip import Clip
 
 __all__ = [
@@ -26,10 +27,13 @@ __all__ = [
 
 def open_clips(path: Path | str | Iterable[Path | str], split: str | None = None) -> ClipList:
     """Return the finished clips of a data set, all or of one split; the one clip of a clip folder; those of a folder
-    of clips, each of which states its split; or those of several folders, one after another.
+    of clips, each of which states its split; those of a published set, in a folder or at an address; or those of
+    several such, one after another.
     """
     if not isinstance(path, Path | str):
         return ClipList([part for folder in path for part in open_clips(folder, split).parts])
+    if is_published(path):
+        return PublishedSet.open(path).clips(split)
     path = Path(path)
     if (path / "clip.json").exists():
         return ClipList.of([Clip.open(path)])

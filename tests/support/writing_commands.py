@@ -24,6 +24,7 @@ LINES = {  # what writes -> what it reads
     "qsim convert clip/streams/f.json e --to photons": ("clip",),
     "qsim convert clip e.mp4": ("clip",),
     "qsim convert clip e.h5 --to pairs --window 2": ("clip",),
+    **{f"qsim publish data -o e --to {kind}": ("data",) for kind in ("webdataset", "parquet", "hdf5", "zarr")},
     "qsim preview clip -o p.png --frame 0": ("clip",),
     "qsim preview clip -o p.gif": ("clip",),
     "qsim preview clip -o p.mp4": ("clip",),

@@ -36,6 +36,7 @@ ROOMS: dict[str, set[str]] = {
         *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.streams", "qsim.rendering"),
         *("qsim.scenes",),
     },
+    "qsim.publishing": {"qsim", "qsim.optics", "qsim.sensor", "qsim.clip", "qsim.streams", "qsim.dataset"},
     "qsim.calibration": {"qsim", "qsim.sensor", "qsim.streams", "qsim.formats"},
     "qsim.studies": {
         *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.streams", "qsim.rendering"),
@@ -45,11 +46,12 @@ ROOMS: dict[str, set[str]] = {
     "qsim.cli": {
         *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.streams", "qsim.rendering"),
         *("qsim.formats", "qsim.scenes", "qsim.dataset", "qsim.calibration", "qsim.studies", "qsim.report"),
+        *("qsim.publishing",),
     },
     "quiver": {"qsim"},
     "quiver.data": {
         *("qsim", "quiver", "qsim.optics", "qsim.sensor", "qsim.clip", "qsim.streams", "qsim.dataset"),
-        *("qsim.formats",),
+        *("qsim.formats", "qsim.publishing"),
     },
     "quiver.model": {"qsim", "quiver"},
     "quiver.baselines": {"qsim", "quiver", "qsim.sensor", "quiver.data"},

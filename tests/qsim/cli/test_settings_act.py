@@ -24,7 +24,7 @@ from acting import (
     stdout,
     threads,
 )
-from clips import colour_clip, write_clip
+from clips import colour_clip, write_clip, write_dataset
 from fakes import write_records
 
 import qsim.cli.program
@@ -68,6 +68,11 @@ def damage(folder: Path) -> None:
     """A data set of which one file of light is gone."""
     assert main(["generate", "t.toml", "-o", "d", "--workers", "0", "-q"]) == 0
     next(folder.glob("d/clips/*/radiance/*.exr")).unlink()
+
+
+def two_clips(folder: Path) -> None:
+    """A data set."""
+    write_dataset(folder / "set", {"train": 2})
 
 
 def needs(line: str, *only: str, before: str = "", **words: str) -> Situation:
@@ -126,6 +131,18 @@ SITUATIONS = (
     Situation("plan t.toml", stdout, slow=True),
     Situation("check clip", stdout),
     Situation("check rest", stdout, codes=(1,), only=("shard",)),
+    # publish
+    Situation("publish set -o e", before=two_clips, only=("shard_size",)),
+    Situation("publish clip -o e"),
+    Situation("publish clip -o e --sensor spad-320x240 --bits 2 --ppp 3 --fields codes"),
+    Situation("publish clip -o e --sensor counter.toml --ppp 3 --fields codes,truth"),
+    Situation("publish clip -o e --sensor my.toml --lux 1 --fields codes"),
+    Situation("publish clip -o e --sensor warm.toml --ppp 0.5", only=("temperature",)),
+    Situation("publish clip -o e --ppp 3 --row-delay 1e-6 --fields codes"),
+    needs("publish relative -o e --lux 1", "pixel_pitch"),
+    needs("publish coloured -o e --sensor quiver-physical", "colour"),
+    Situation("publish clip -o e", names, only=("output",)),
+    replaces("publish clip -o e --packed", "publish clip -o e"),
     # compare, preview, report, explore
     Situation("compare clip", stdout),
     Situation("preview clip", stdout),
@@ -277,6 +294,11 @@ COMMANDS = Commands(
         "plane_sensor": "spad-320x240",
         "preview.output": "other.png",
         "print": "demo",
+        "publish.fields": "radiance",
+        "publish.licence": "MIT",
+        "publish.to": "hdf5",
+        "publish.shard": "2/2",
+        "publish.shard_size": "1e-6",
         "px": "3",
         "replay": "clip:2",
         "report.output": "other.html",
@@ -309,7 +331,7 @@ COMMANDS = Commands(
         "convert.ppp": described,
     },
     may_be_silent=frozenset({"threads", "force", "memory", "workers", "retry", "repair", "wait"}),
-    prepared=frozenset({"replay"}),
+    prepared=frozenset({"replay", "shard_size"}),
     never_here={
         "generate.workers": "speed alone",
         "generate.memory": "speed alone",
