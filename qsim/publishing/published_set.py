@@ -27,9 +27,9 @@ from qsim import descriptions
 from qsim.checks import SPLITS
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.clip_info import ClipInfo
-from qsim.clip.lazy_array import LazyArray
 from qsim.dataset.clip_list import ClipList
 from qsim.host import own_numbers
+from qsim.lazy_array import LazyArray
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.publishing.contents import CHANNELS
 from qsim.publishing.located import Entry, Located
@@ -374,10 +374,15 @@ class PublishedStream(Stream):
         return found
 
     @cached_property
-    def packed(self) -> Array:
-        """The packed codes, uint8 [T, H, ceil(W*bits/8)]; `ValueError` if codes were not published."""
-        frames = self._published(0, len(self), None)
-        return frames if self._described["packed"] else packing.pack(frames, self.bits)
+    def packed(self) -> LazyArray:
+        """The packed codes, uint8 [T, H, ceil(W*bits/8)]; reading raises `ValueError` if codes were not published."""
+
+        def read(start: int, stop: int, crop: Crop | None) -> Array:
+            found = self._published(start, stop, None)
+            return _cut(found if self._described["packed"] else packing.pack(found, self.bits), crop)
+
+        frames, height, width = self.shape
+        return LazyArray((frames, height, packing.packed_width(width, self.bits)), np.dtype(np.uint8), read)
 
     def _published(self, start: int, stop: int, crop: Crop | None) -> Array:
         name = self._described.get("codes")
