@@ -18,6 +18,7 @@ from qsim.clip.manifest import target_of
 from qsim.dataset import scene_files
 from qsim.files import NAME, Progress
 from qsim.host import own_numbers
+from qsim.notebook import reporting
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.fidelity import choose_budget
@@ -71,7 +72,8 @@ def render(  # noqa: PLR0913 (settings of a public function)
 
     `path` is the folder of the clip; an equal call resumes an interrupted one. Without it, the clip lies in a temporary
     folder that is deleted after the last use of the clip and its streams. `progress(done, frames)` is called after each
-    frame. `ValueError`, `FileNotFoundError` or `FileExistsError` where the arguments do not fit.
+    frame; a notebook shows a bar without it. `ValueError`, `FileNotFoundError` or `FileExistsError` where the arguments
+    do not fit.
 
         clip = qsim.render("fan", frames=21, psnr=35)
     """
@@ -112,18 +114,19 @@ def render(  # noqa: PLR0913 (settings of a public function)
         )
     temporary = TemporaryFolder() if path is None else None
     name = loaded.name if NAME.fullmatch(loaded.name) else "scene"
-    clip = render_clip(
-        loaded,
-        temporary.path / name if temporary else Path(path or ""),
-        frames=frames,
-        frame_rate=frame_rate,
-        shutter=shutter,
-        seed=seed,
-        budget=budget,
-        progress=progress,
-        made_of=Origin(reads=read),
-        force=force,
-    )
+    with reporting(progress, name) as heard:
+        clip = render_clip(
+            loaded,
+            temporary.path / name if temporary else Path(path or ""),
+            frames=frames,
+            frame_rate=frame_rate,
+            shutter=shutter,
+            seed=seed,
+            budget=budget,
+            progress=heard,
+            made_of=Origin(reads=read),
+            force=force,
+        )
     return replace(clip, keeps=temporary)
 
 

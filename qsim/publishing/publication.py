@@ -24,6 +24,7 @@ from qsim.dataset.clip_list import ClipList
 from qsim.dataset.dataset import Dataset, Part, checked_part
 from qsim.files import Progress
 from qsim.host import own_numbers
+from qsim.notebook import reporting
 from qsim.publishing import croissant, data_card
 from qsim.publishing.contents import FIELDS, Field, Sample, sample_of, sensed
 from qsim.publishing.place import Folder, Place, place, write
@@ -207,8 +208,9 @@ def publish(
     """Publish a data set, or one clip, in a folder or at an address of fsspec, as s3://bucket/set; resume if begun.
 
     `part` (i, n) makes the i-th of n parts of the shards; who makes the last one writes the data card. `force` replaces
-    another published set. `progress(done, total)` counts clips. `ValueError` for a set that lacks clips,
-    `FileExistsError` where others' files are, `OSError` where a storage fails: what is there is complete.
+    another published set. `progress(done, total)` counts clips; a notebook shows a bar without it. `ValueError` for a
+    set that lacks clips, `FileExistsError` where others' files are, `OSError` where a storage fails: what is there is
+    complete.
     """
     found = Source.open(Path(source), wanted or Publication())
     chosen = found.shards if part is None else found.shards[checked_part(part)[0] - 1 :: part[1]]
@@ -217,6 +219,18 @@ def publish(
     if force and part is not None:
         raise ValueError("shard: parts of a published set do not replace it; run without force=True, after deleting it")
     _begin(where, found.digest, force)
+    with reporting(progress, found.name, "clip") as heard:
+        made = _write_missing(where, found, chosen, columns, heard)
+    complete = _finish(where, found)
+    sizes = [complete[shard.name].size for shard in found.shards if shard.name in complete]
+    clips = sum(map(len, found.clips.values()))
+    return Published(where.address, clips, len(found.shards), made, sum(sizes), len(sizes) == len(found.shards))
+
+
+def _write_missing(
+    where: Place, found: Source, chosen: Sequence[Shard], columns: Sequence[str], progress: Progress | None
+) -> int:
+    """Write those shards that are not complete; return their number."""
     total = sum(shard.stop - shard.start for shard in chosen)
     done = 0
     made = 0
@@ -227,10 +241,7 @@ def publish(
             made += 1
         done += shard.stop - shard.start
         _count(progress, done, total, 0)
-    complete = _finish(where, found)
-    sizes = [complete[shard.name].size for shard in found.shards if shard.name in complete]
-    clips = sum(map(len, found.clips.values()))
-    return Published(where.address, clips, len(found.shards), made, sum(sizes), len(sizes) == len(found.shards))
+    return made
 
 
 def _count(progress: Progress | None, before: int, total: int, done: int) -> None:

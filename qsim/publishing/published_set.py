@@ -37,6 +37,7 @@ from qsim.publishing.place import Place, is_address, place
 from qsim.publishing.record import CURE, SET, Places, SetInfo, ShardSummary, load, reader_of
 from qsim.sensor import packing
 from qsim.streams.clip import Clip
+from qsim.streams.event_stream import EventStream
 from qsim.streams.stream import Stream
 from qsim.streams.stream_info import StreamInfo
 
@@ -304,6 +305,10 @@ class PublishedClip(Clip):
     def sense(self, *_: Any, **settings: Any) -> Stream:
         """Raise `ValueError`: a published set is not written to."""
         raise ValueError(f"{self.path}: a published set is not written to; sense the data set that it was made of")
+
+    def sense_events(self, *_: Any, **settings: Any) -> EventStream:
+        """Raise `ValueError`: a published set is not written to, and events are not published."""
+        raise ValueError(f"{self.path}: a published set is not written to; draw events of the set that it was made of")
 
     def verify(self, progress: Any = None) -> list[str]:
         """Return no problems: shards are compared as a whole with the SHA-256 in their records."""

@@ -15,6 +15,7 @@ from qsim.clip.clip_folder import ClipFolder
 from qsim.files import Progress, check_name
 from qsim.host import own_numbers
 from qsim.keys import Key
+from qsim.notebook import reporting
 from qsim.optics.radiometry import LightLevel
 from qsim.sensor import devices, file_laws, packing
 from qsim.sensor.defects.event_simulation import TOLERANCE
@@ -90,7 +91,8 @@ def sense(
     """Draw and store a stream; return it and a one-line summary of its light level.
 
     A stream of this name is kept if its settings are the same; `FileExistsError` for other settings without `force`.
-    While another process senses this clip, wait after a call of `on_wait`.
+    A notebook shows a bar where no `progress` is given. While another process senses this clip, wait after a call of
+    `on_wait`.
     """
     draw, info = _described(clip, sensing)
     missed = info.dead_time_effects
@@ -116,8 +118,9 @@ def sense(
         kept = None if force else _kept(clip, sensing, info)  # another process may have made it
         if kept is not None:
             return kept, line
-        blocks = draw.packed(clip, info.shape[0], progress)
-        return _write(clip, sensing.stream_name, blocks, info), line
+        with reporting(progress, sensing.stream_name) as heard:
+            blocks = draw.packed(clip, info.shape[0], heard)
+            return _write(clip, sensing.stream_name, blocks, info), line
 
 
 @own_numbers

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.notebook import reporting
 from qsim.plane_sums import PlaneSums
 from quiver.data.clips import Clip
 from quiver.data.codes import (
@@ -69,6 +70,8 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     filled and told by a warning; `scan=False` leaves them. `ValueError` or `FileNotFoundError` where the arguments do
     not fit together.
 
+    A notebook shows a bar while it restores.
+
         video = quiver.restore(stream)
     """
     opened = np.asarray(source) if isinstance(source, LazyArray) else _opened(source)
@@ -89,7 +92,8 @@ def restore(  # noqa: PLR0913 (settings of a public function)
         found.append(f"{codes.name}: {codes.scan}, and filled; leave them with scan=False")
     for text in found:
         warnings.warn(text, stacklevel=3)  # behind `own_numbers`
-    restored = runner.restore(codes)
+    with reporting(None, codes.name) as progress:
+        restored = runner.restore(codes, progress=progress)
     try:
         check_finite(restored, runner.name)
     except ValueError as error:
