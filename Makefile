@@ -1,6 +1,7 @@
 # make demo    scenes -> few-bit frames -> restored video, as one page: out/demo/index.html
 # make test    the quick tests (about nine minutes on two cores of 2.6 GHz); make test-slow: the long ones
 # make lint    style and types; make docs: the manual into out/site
+# make reference    the parts of its pages that come from the code
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -8,7 +9,7 @@ EXTRAS := llvm,networks,cluster,denoise,video,formats,publish,s3,tiff,tcspc,drac
 # One thread per test process: two processes share two cores.
 TEST_ENV := OMP_NUM_THREADS=1 PYTHONWARNINGS=error::SyntaxWarning
 
-.PHONY: setup demo test test-slow lint docs clean
+.PHONY: setup demo test test-slow lint docs reference clean
 
 setup: .venv/.ready
 
@@ -33,6 +34,9 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+reference: setup
+	$(BIN)/python docs/manual/generated.py
 
 docs: setup
 	$(BIN)/sphinx-build -W --keep-going -q -E -j auto -d out/doctrees docs out/site

@@ -1,7 +1,7 @@
 """Builds the manual: what Sphinx needs beyond its own extensions. `make docs` builds; nothing is executed or fetched.
 
-Pages are Markdown. Comments such as `<!-- keys: [recipe] -->` are replaced by what is made from the code, and
-`<!-- page: ../scenes/README.md -->` by that page.
+Pages are Markdown. `<!-- page: ../scenes/README.md -->` is replaced by that page. Parts that come from the code stand
+in the pages (generated.py).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from manual import api, commands, examples, keys, mathml, menu
+from manual import api, examples, mathml, menu
 
 _PAGE = re.compile(r"^<!-- page: (\S+) -->$", re.MULTILINE)
 _SHELL = re.compile(r"^```sh\n.*?^```$", re.MULTILINE | re.DOTALL)
@@ -37,7 +37,7 @@ def _insert(app: Any, page: str, source: list[str]) -> None:
     if page.startswith("examples/"):
         source[0] = examples.page(page.removeprefix("examples/"))
     source[0] = _PAGE.sub(lambda found: moved(Path(app.srcdir) / found[1]), source[0])
-    source[0] = comments_above(menu.insert(commands.insert(keys.insert(source[0]))))
+    source[0] = comments_above(menu.insert(source[0]))
 
 
 def comments_above(text: str) -> str:

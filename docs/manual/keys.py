@@ -1,20 +1,8 @@
-"""Writes tables of the keys of recipes and of `[defects]`, in place of `<!-- keys: SECTION -->`.
-
-The keys are those that `qsim recipes --keys` and `qsim sensors --keys` print.
-"""
+"""Writes tables of the keys of recipes and of sensor files: those that `qsim recipes --keys` and the like print."""
 
 from __future__ import annotations
 
-import re
-
-from qsim.cli.documented_keys import Key, keys
-
-_MARK = re.compile(r"^<!-- keys: (\[\S+\]) -->$", re.MULTILINE)
-
-
-def insert(text: str) -> str:
-    """Return a page with tables in place of its comments."""
-    return _MARK.sub(lambda found: table(keys(found[1])), text)
+from qsim.cli.documented_keys import Key
 
 
 def table(rows: list[Key]) -> str:

@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 sys.path.append(str(DOCS))
 
-from manual import api, commands, comments_above, mathml, menu  # noqa: E402
+from manual import api, comments_above, generated, mathml, menu  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -99,8 +99,7 @@ def test_fields_carry_the_comments_behind_them():
 @pytest.mark.parametrize("program", [qsim.cli.program, quiver.cli.program], ids=["qsim", "quiver"])
 def test_every_option_of_every_command_is_in_the_reference(program):
     found = program.PROGRAM
-    page = (DOCS / f"{found.name}.md").read_text(encoding="utf-8")
-    text = commands.insert(page)
+    text = (DOCS / f"{found.name}.md").read_text(encoding="utf-8")
     parts = {part.partition("\n")[0]: part for part in text.split("\n## ")}
     assert set(parts) >= {f"{found.name} {name}" for name in found.commands}
     common = (DOCS / "qsim.md").read_text(encoding="utf-8")
@@ -110,6 +109,13 @@ def test_every_option_of_every_command_is_in_the_reference(program):
                 for option in option_names(setting):
                     where = parts[f"{found.name} {name}"]
                     assert f"`{option}" in where or f"`{option}`" in common, option
+
+
+@pytest.mark.parametrize("page", generated.pages(), ids=lambda path: path.stem)
+def test_the_generated_parts_of_a_page_are_those_of_the_code(page):
+    text = page.read_text(encoding="utf-8")
+    assert generated.filled(text) == text, "make reference"
+    assert generated.filled(text.replace("| `", "| old `")) == text, "a stale part is noticed"
 
 
 RECORDS = dict(recipe_file.SECTIONS) | {"[sensor]": Laws, "[defects]": DefectKeys}
