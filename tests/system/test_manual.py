@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 sys.path.append(str(DOCS))
 
-from manual import api, comments_above, generated, mathml, menu  # noqa: E402
+from manual import api, comments_above, generated, mathml, menu, rooms  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +116,14 @@ def test_the_generated_parts_of_a_page_are_those_of_the_code(page):
     text = page.read_text(encoding="utf-8")
     assert generated.filled(text) == text, "make reference"
     assert generated.filled(text.replace("| `", "| old `")) == text, "a stale part is noticed"
+
+
+def test_the_picture_of_the_rooms_is_drawn_from_the_imports():
+    """An arrow that follows from others is left out, and none leads upwards."""
+    assert rooms.PICTURE.read_text(encoding="utf-8") == rooms.drawing(), "python docs/manual/rooms.py"
+    assert rooms.reduced({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == {"a": {"b"}, "b": {"c"}, "c": set()}
+    heights = rooms.heights(rooms.imports())
+    assert all(heights[room] > heights[one] for room, asked in rooms.imports().items() for one in asked)
 
 
 RECORDS = dict(recipe_file.SECTIONS) | {"[sensor]": Laws, "[defects]": DefectKeys}
