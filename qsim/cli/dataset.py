@@ -268,7 +268,8 @@ class Check:
     """What `qsim check` compares."""
 
     paths: Annotated[
-        tuple[Path, ...], setting("data sets, clips, streams, restored video", shown="PATH", positional=True)
+        tuple[Path, ...],
+        setting("data sets, also published, clips, streams, restored video", shown="PATH", positional=True),
     ]
     shard: Annotated[
         tuple[int, int] | None,
@@ -287,10 +288,15 @@ class Check:
 def check(asked: Check) -> int:
     """Print the problems of all files; return 1 if there are any."""
     from qsim.dataset import checking
+    from qsim.publishing.published_set import PublishedSet, is_published
 
     problems: list[str] = []
     again: list[checking.Redrawn] = []
     for path in asked.paths:
+        if is_published(path):
+            with bar(str(path), "shard") as progress:
+                problems += PublishedSet.open(path).verify(progress, asked.shard)
+            continue
         with bar(str(path), "clip" if (path / "dataset.json").is_file() else "file") as progress:
             problems += checking.check(path, progress, asked.shard)
         if asked.redraw:

@@ -86,10 +86,16 @@ def publish(asked: Publish, sensing: Annotated[dict[str, Any], Sensing, *SENSED,
     )
     with bar("publishing", "clip") as progress:
         made = write(asked.data, asked.output, wanted, part=asked.shard, force=asked.force, progress=progress)
-    begun = f"{made.shards} shards of {made.clips} clips, {made.made} written now, {made.size / 1e6:.1f} MB"
+    begun = f"{_counted(made.clips, 'clip')} in {_counted(made.shards, 'shard')}, {made.made} written now"
+    begun += f", {made.size / 1e6:.1f} MB"
     left = "" if made.complete else "; other parts are missing, and the data card comes with the last one"
     output(dataclasses.asdict(made), f"{made.address}: {begun}{left}")
     return 0
+
+
+def _counted(number: int, what: str) -> str:
+    """Return `1 clip` or `2 clips`."""
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def _sensings(given: dict[str, Any]) -> tuple[Sensing, ...]:

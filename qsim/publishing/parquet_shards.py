@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files
@@ -91,8 +90,7 @@ class Reader:
     """Reads cells by pyarrow."""
 
     def array(self, where: Place, file: str, entry: Entry, field: str) -> Array:
-        array: Array = np.load(io.BytesIO(_cell(where, file, entry, field)), allow_pickle=False)
-        return array
+        return files.read_npy(Path(where.address) / file, io.BytesIO(_cell(where, file, entry, field)))
 
     def description(self, where: Place, file: str, entry: Entry) -> bytes:
         text: str = _cell(where, file, entry, "description")

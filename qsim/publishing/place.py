@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Protocol
 
 from qsim import files, limits, opening, scratch
 
-_ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://.+")
+_ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://.*", re.DOTALL)
 
 
 def is_address(text: str | os.PathLike[str]) -> bool:
@@ -54,11 +54,18 @@ class Place(Protocol):
 
 
 def place(address: str | os.PathLike[str]) -> Place:
-    """Return the place of an address; `ModuleNotFoundError` for a storage whose package is not installed."""
+    """Return the place of an address; `ModuleNotFoundError` for a storage whose package is not installed.
+
+    `ValueError` for an address without a bucket.
+    """
     text = os.fspath(address)
     if text.startswith("file://"):
         text = text.removeprefix("file://")
-    return Storage(text.rstrip("/")) if is_address(text) else Folder(Path(text))
+    if not is_address(text):
+        return Folder(Path(text))
+    if not text.partition("://")[2].strip("/"):
+        raise ValueError(f"{text}: names no bucket; give one, as in {text.partition(':')[0]}://BUCKET/SET")
+    return Storage(text.rstrip("/"))
 
 
 def write(where: Place, name: str, content: bytes) -> None:

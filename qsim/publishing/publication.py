@@ -192,7 +192,7 @@ class Source:
         of_pixel = {"radiance": 2 * bands, "sharp": 2 * bands * clip.info.has_sharp}
         of_pixel |= {"codes": len(self.codes), "truth": 4 * bands * len(self.codes)}
         of_pixel |= BYTES if clip.has_truth else {}
-        return frames * height * width * sum(of_pixel.get(field, 0) for field in self.wanted.fields)
+        return frames * height * width * max(1, sum(of_pixel.get(field, 0) for field in self.wanted.fields))
 
 
 @own_numbers
@@ -213,8 +213,8 @@ def publish(
     complete.
     """
     found = Source.open(Path(source), wanted or Publication())
-    chosen = found.shards if part is None else found.shards[checked_part(part)[0] - 1 :: part[1]]
     columns = found.columns
+    chosen = found.shards if part is None else found.shards[checked_part(part)[0] - 1 :: part[1]]
     where = place(address)
     if force and part is not None:
         raise ValueError("shard: parts of a published set do not replace it; run without force=True, after deleting it")
@@ -276,9 +276,15 @@ def _begin(where: Place, digest: str, force: bool) -> None:
 
 
 def _check_folder(where: Folder) -> None:
-    """Delete what killed writers left; `FileExistsError` where the folder is a file or a link."""
+    """Delete what killed writers left; `FileExistsError` for a file, a link, and a place in a clip or data set."""
     if where.path.is_symlink() or (where.path.exists() and not where.path.is_dir()):
         raise FileExistsError(f"{where.path}: is a file or a link, and a folder is needed; name another output")
+    for above in (where.path.absolute(), *where.path.absolute().parents):
+        for mark, kind in (("clip.json", "clip"), ("dataset.json", "data set")):
+            if (above / mark).is_file():
+                raise FileExistsError(
+                    f"{where.path}: is in the {kind} {above}, which holds nothing else; name another output"
+                )
     if where.path.is_dir():
         where.sweep()
 

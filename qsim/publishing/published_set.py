@@ -9,6 +9,7 @@ array. Memory does not grow with the set.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from bisect import bisect_right
@@ -23,11 +24,13 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import descriptions
+from qsim import descriptions, files
 from qsim.checks import SPLITS
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.clip_info import ClipInfo
 from qsim.dataset.clip_list import ClipList
+from qsim.dataset.dataset import Part, checked_part
+from qsim.files import Progress
 from qsim.host import own_numbers
 from qsim.lazy_array import LazyArray
 from qsim.optics.radiometry import Crop, check_crop
@@ -43,6 +46,7 @@ from qsim.streams.stream_info import StreamInfo
 
 BLOCK = 16  # frames that are read from a remote shard at a time
 KEPT = 1 << 27  # bytes of blocks and arrays that stay in memory, of a process
+PIECE = 1 << 22  # bytes that are read at once of a shard that is checked
 SHARDS = 64  # whose places stay in memory
 
 
@@ -72,6 +76,31 @@ class PublishedSet:
     def __repr__(self) -> str:
         counts = ", ".join(f"{self._count(split)} {split}" for split in SPLITS if split in self.info.shards)
         return f"<PublishedSet {self.info.name}: clips {counts}, as {self.info.to}>"
+
+    def verify(self, progress: Progress | None = None, part: Part | None = None) -> list[str]:
+        """Return one message for each shard that is missing or has another SHA-256 than its record; empty if intact.
+
+        `part` (i, n) takes the i-th of n parts. `progress(done, total)` is called after each shard.
+        """
+        shards = [shard for split in SPLITS for shard in self.info.shards.get(split, ())]  # type: ignore[call-overload]
+        chosen = shards if part is None else shards[checked_part(part)[0] - 1 :: part[1]]
+        problems = []
+        for done, shard in enumerate(chosen, 1):
+            problems += self._differs(shard)
+            if progress is not None:
+                progress(done, len(chosen))
+        return problems
+
+    def _differs(self, shard: ShardSummary) -> list[str]:
+        name = f"{self.address}/{shard.file}"
+        if self.where.size(shard.file) is None:
+            return [f"{name}: missing; {CURE}"]
+        digest = hashlib.sha256()
+        with self.where.opened(shard.file) as file:
+            while block := file.read(PIECE):
+                digest.update(block)
+        same = digest.hexdigest() == shard.sha256
+        return [] if same else [f"{name}: contents changed (checksum differs); {CURE}"]
 
     def clips(self, split: str | None = None) -> ClipList:
         """Return the clips of one split, or of all. `ValueError` for an unknown split."""
@@ -193,8 +222,10 @@ class Stored:
     @cached_property
     def description(self) -> dict[str, Any]:
         """The description of the clip."""
-        content = reader_of(self.data.info.to).description(self.data.where, self.file, self.entry)
-        found: dict[str, Any] = json.loads(content)
+        path = Path(self.data.address) / self.file
+        with files.decoding_errors(path, self.data.info.to):
+            content = reader_of(self.data.info.to).description(self.data.where, self.file, self.entry)
+            found: dict[str, Any] = json.loads(content)
         inside = found.get("attributes", {}).get("description") if self.data.info.to == "zarr" else found
         if not isinstance(inside, dict) or inside.get("clip") != self.entry.clip:
             raise ValueError(f"{self.data.address}/{self.file}: is not the shard that is described; {CURE}")
@@ -213,7 +244,13 @@ class Stored:
         """Return an array, read by its format."""
 
         def read() -> Array:
-            return reader_of(self.data.info.to).array(self.data.where, self.file, self.entry, name)
+            path = Path(self.data.address) / self.file
+            with files.decoding_errors(path, self.data.info.to):
+                found = reader_of(self.data.info.to).array(self.data.where, self.file, self.entry, name)
+            located = self.entry.arrays[name]
+            if found.shape != located.shape or found.dtype != np.dtype(located.dtype):
+                raise ValueError(f"{path}: {name} is {found.dtype} {list(found.shape)}, other than described; {CURE}")
+            return found
 
         return _KEPT.get((self.data.info.digest, self.data.address, self.entry.key, name), read)
 

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from qsim import descriptions, files
-from qsim.kinds import Count, Digest, Split, Text
+from qsim.kinds import Count, Digest, Split, Text, text_like
 from qsim.parsing import parse_json
 from qsim.publishing import hdf5_shards, parquet_shards, tar_shards, zarr_shards
 from qsim.publishing.located import Entry, ShardReader
@@ -31,11 +31,13 @@ MODULES: dict[str, Any] = {
 SET = "published.json"
 CARD = "README.md"
 CROISSANT = "croissant.json"
-OURS = (
+OTHERS = (
     r"published\.json|README\.md|croissant\.json|LICEN[CS]E[A-Za-z0-9._-]*|pictures/[A-Za-z0-9._-]+\.png"
     r"|(places|records)/(train|val|test)-[0-9]{5,}\.json"
-    r"|shards/(train|val|test)-[0-9]{5,}\.(tar|parquet|h5|zarr\.zip)"
 )
+SHARD = r"shards/(train|val|test)-[0-9]{5,}\.(tar|parquet|h5|zarr\.zip)"
+ShardFile = Annotated[str, text_like(SHARD, "a name as shards/train-00000.tar")]
+OURS = rf"{OTHERS}|{SHARD}"
 CURE = "publish the set again with force=True"
 Made = TypeVar("Made")
 
@@ -55,7 +57,7 @@ class ShardRecord:
 
     FORMAT: ClassVar[str] = "published shard"
     digest: Digest  # of what is published
-    file: Text
+    file: ShardFile
     size: Count  # bytes
     sha256: Digest
     split: Split
@@ -66,7 +68,7 @@ class ShardRecord:
 class ShardSummary:
     """A shard as the description of the set lists it."""
 
-    file: Text
+    file: ShardFile
     clips: Count
     size: Count
     sha256: Digest

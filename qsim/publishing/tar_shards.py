@@ -85,9 +85,9 @@ class Reader:
         found = entry.arrays[field]
         assert isinstance(found.at, int)
         assert found.bytes is not None
-        content = gzip.decompress(where.read(file, found.at, found.at + found.bytes))
-        array: Array = np.load(io.BytesIO(content), allow_pickle=False)
-        return array
+        packed = io.BytesIO(where.read(file, found.at, found.at + found.bytes))
+        with gzip.GzipFile(fileobj=packed) as content:
+            return files.read_npy(Path(where.address) / file, content)
 
     def description(self, where: Place, file: str, entry: Entry) -> bytes:
         assert entry.description is not None
