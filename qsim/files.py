@@ -55,10 +55,13 @@ class Damaged(ValueError):
         self.cure = cure
 
 
+DISTRIBUTION = "qsim-quiver"  # on a package index, where `qsim` is another program
+
+
 def _version() -> str:
     """Return the version of the installed package, or of a source tree without installation."""
     try:
-        return metadata.version("qsim")
+        return metadata.version(DISTRIBUTION)
     except metadata.PackageNotFoundError:
         project = Path(__file__).parents[1] / "pyproject.toml"
         return str(parse_toml(project, project.read_text(encoding="utf-8"))["project"]["version"])

@@ -13,7 +13,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import limits, opening
-from qsim.files import decoding_errors
+from qsim.files import DISTRIBUTION, decoding_errors
 from qsim.formats import axes
 from qsim.formats.recording import Hints
 
@@ -95,6 +95,6 @@ def _naming_the_package(path: Path, page: int, found: Any) -> Iterator[None]:
         how = getattr(found.compression, "name", found.compression)
         kind = f"{found.bitspersample}-bit pixels" if found.compression == 1 else f"compression {how}"
         raise ValueError(
-            f"{path}: page {page} has {kind}, which the package imagecodecs decodes: pip install 'qsim[tiff]', or "
-            "save it uncompressed with 8 or 16 bits"
+            f"{path}: page {page} has {kind}, which the package imagecodecs decodes: "
+            f"pip install '{DISTRIBUTION}[tiff]', or save it uncompressed with 8 or 16 bits"
         ) from None
