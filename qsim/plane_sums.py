@@ -57,14 +57,14 @@ class PlaneSums(PlaneRange):
     planes: Annotated[
         Summed | None,
         setting(
-            "sum so many successive planes to a code: of a recording of single bits, or frames of a clip sensed now",
+            "sum so many successive binary planes to a code",
             unset="1",
         ),
     ] = None
     summed: Annotated[
         Summed | None,
         setting(
-            "file without a description: the camera has summed so many binary planes to each of its codes",
+            "bare file: the camera summed so many binary planes to each code",
             unset="2^bits - 1",
         ),
     ] = None

@@ -36,7 +36,7 @@ class Calibrate:
     static: Annotated[
         tuple[Path, Positive] | None,
         setting(
-            "counts of a static scene, instead of dark and flat frames: measures the dead time from Fano factors",
+            "counts of a static scene: measures the dead time from Fano factors",
             shown="FILE SECONDS",
             several="following",
         ),

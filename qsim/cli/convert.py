@@ -35,9 +35,7 @@ KINDS = sorted([*exporting.EXPORTS, "pairs"])
 class Convert:
     """What `qsim convert` reads and writes; the facts of its files are `Hints`."""
 
-    input: Annotated[
-        Path, setting("a file, a folder, a clip, a stream or events (.npy or .json), a data set", positional=True)
-    ]
+    input: Annotated[Path, setting("a file, a folder, a clip, a stream, events or a data set", positional=True)]
     output: Annotated[
         Path, setting("clip folder, stream name, .npy, .mp4 or .zarr, or a folder with --to", positional=True)
     ]
@@ -63,9 +61,7 @@ class Convert:
     to: Annotated[
         str | None,
         setting(
-            "kind of the output; pairs: codes, truth and flow in one .h5; events: .h5 or .npz; challenge: cubes of "
-            "colour planes with their truth; nerfstudio: pictures and their poses, transforms.json (planes end before "
-            "--until)",
+            "kind of the output, one of those that docs/files.md describes",
             unset="from the suffix of its name",
             section=OTHERS,
             choices=KINDS,

@@ -26,7 +26,7 @@ class Render:
     scene: Annotated[
         str,
         setting(
-            "a family of scenes/, a .py file with scene(seed, speed=...), a .glb or .gltf, Mitsuba .xml, a folder",
+            "a family of scenes/, a .py, .glb, .gltf or Mitsuba .xml file, a folder",
             positional=True,
             known=families,
         ),
@@ -37,14 +37,11 @@ class Render:
     speed: Annotated[Speed, setting("factor on all motions")] = 1.0
     ppp: Annotated[
         Positive | None,
-        setting(
-            "highest light level you will sense, photons per pixel and code; sets samples so that the Monte-Carlo "
-            "variance stays below 1 % of the shot variance"
-        ),
+        setting("brightest light you will sense, photons per pixel and code; sets the samples"),
     ] = None
     planes: Annotated[
         Frames | None,
-        setting("frames that a code will sum as binary planes: together they have the samples of a frame", unset="1"),
+        setting("frames that a code will sum as binary planes; they share its samples", unset="1"),
     ] = None
     engine: Annotated[str | None, setting("engine to use", unset="QSIM_ENGINE, else the fastest", choices=BACKENDS)] = (
         None

@@ -19,7 +19,7 @@ from qsim.settings import setting
 from qsim.time_forecast import TimeForecast
 from qsim.words import frame_size, steps
 
-_SENSORS = "a name of `qsim doctor --devices`, or a file of a SPAD or of a QIS with gain 1, whatever its bits"
+_SENSORS = "a name of `qsim doctor --devices`, or a sensor file"
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,14 @@ class Tradeoff:
     px: Annotated[
         list[float] | None,
         setting(
-            "motion of the moving pixels, px per 3-bit frame of 7 planes, listed as in --ppp; sets the speed, and the "
-            "moving pixels alone are scored",
+            "motion of the pixels that are scored, px per 3-bit frame; sets the speed",
             read=steps,
         ),
     ] = None
     sensor: Annotated[
         str | None,
         setting(
-            f"sensor of the multi-bit read: {_SENSORS}; another QIS file at its own --bits",
+            f"sensor of the multi-bit read: {_SENSORS}",
             unset="quiver-physical",
             known=sensors,
         ),
@@ -70,7 +69,7 @@ class Tradeoff:
     plane_sensor: Annotated[
         str | None,
         setting(
-            f"sensor of a binary plane: {_SENSORS}; another QIS file if it has 1 bit",
+            f"sensor of a binary plane: {_SENSORS}",
             unset="a clocked SPAD of the same efficiency",
             known=sensors,
         ),

@@ -84,9 +84,7 @@ class Layout:
         Count | None,
         setting("raw: rows begin at a byte, and N bytes follow each", unset="rows follow bit by bit", shown="N"),
     ] = None
-    axes: Annotated[
-        Text | None, setting("names of the axes of an array, an HDF5 dataset or a TIFF, as in TCYX or YXT")
-    ] = None
+    axes: Annotated[Text | None, setting("names of the axes of an array, as in TCYX or YXT")] = None
     channel: Annotated[Count | None, setting("index of an axis C to read, from 0", shown="N")] = None
     slice: Annotated[Count | None, setting("index of an axis Z to read, from 0", shown="N")] = None
     dataset: Annotated[
@@ -116,10 +114,7 @@ class Hints(Layout):
     ] = False
     white: Annotated[
         Positive | None,
-        setting(
-            "reading: pixel value at which the camera saturates, as in 4095 (default: the largest that whole numbers "
-            "hold); writing pictures: light that becomes full scale (default: the 99.9th percentile)"
-        ),
+        setting("reading: pixel value at which the camera saturates; writing pictures: light at full scale"),
     ] = None
 
 

@@ -24,9 +24,7 @@ class RenderSettings:
         Frames | None, setting("width of the frames", unit="px", unset=f"the scene's, or {SIDE}", example=128)
     ] = None
     frame_rate: Annotated[FrameRate, setting("frames per second of the scene's time", unit="Hz")] = 2000.0
-    shutter: Annotated[Shutter, setting("open share of a frame; 0: a sharp instant with the light of a full frame")] = (
-        0.0
-    )
+    shutter: Annotated[Shutter, setting("open share of a frame; 0: sharp, with the light of a full frame")] = 0.0
     psnr: Annotated[Psnr, setting("wanted error of the radiance, below white, clamped there", unit="dB")] = 40.0
     bands: Annotated[Literal["rgb"] | None, setting("colour: bands R, G and B", unset="one band", example="rgb")] = None
     camera_path: Annotated[

@@ -29,7 +29,7 @@ AskedSeed = Annotated[Seed, setting("seed of the noise", example=1)]
 AskedPitch = Annotated[
     Positive | None,
     setting(
-        "metres, of a clip without a camera (imported video), so that its lux are known: 1.1e-6",
+        "pixel pitch of a clip without a camera, for its lux: 1.1e-6",
         unit="m",
         recipe=False,
     ),
@@ -72,8 +72,7 @@ class Sensing:
     defects: Annotated[
         Text | Defects | None,
         setting(
-            "table [defects]: hot and dead pixels, PRNU, offsets, measured maps, afterpulses, crosstalk, dead time "
-            "that is carried over",
+            "file with a table [defects]: hot and dead pixels, maps, afterpulses, crosstalk",
             unset="that of the sensor's own .toml file",
             shown="FILE.toml",
             recipe=False,
@@ -82,7 +81,7 @@ class Sensing:
     slices: Annotated[
         Frames,
         setting(
-            "counting SPAD or QIS: clip frames per exposure, so that light may change within it (motion blur)",
+            "counting SPAD or QIS: clip frames per exposure, for motion blur",
             example=16,
         ),
     ] = 1
@@ -106,14 +105,14 @@ class Sensing:
     exposures: Annotated[
         Schedule | None,
         setting(
-            "shares of a code's time with light, in turn, as in 1,0.25,0.0625; light levels are of full exposures",
+            "shares of a code's time with light, in turn, as in 1,0.25,0.0625",
             unset="all of it",
             example=[1.0, 0.25],
         ),
     ] = None
     light_drift: Annotated[
         Rise,
-        setting("rise of the light from the first code to the last, as a share: a lamp that warms up", example=0.2),
+        setting("rise of the light from the first code to the last, as a share", example=0.2),
     ] = 0.0
     follow: Annotated[bool, setting("counting SPAD: draw photon by photon, so that their times are known")] = False
     temperature: Annotated[

@@ -75,7 +75,7 @@ class EvaluateSettings:
     static: Annotated[
         Path | None,
         setting(
-            "photon counts [N,H,W] or [T,K,H,W], .npy or .npz; or binary planes to sum, a stream or .npy",
+            "photon counts [N,H,W] or [T,K,H,W], or binary planes to sum",
             shown="COUNTS",
         ),
     ] = None

@@ -28,22 +28,21 @@ class RestoreSettings:
     source: Annotated[
         Path,
         setting(
-            "stream (.npy with its .json), clip folder, bare .npy array, or (for a .zip) cubes of the challenge",
+            "stream, clip folder, bare .npy array, or cubes of the challenge",
             positional=True,
         ),
     ]
     output: Annotated[
         Path,
         setting(
-            ".npy to write, or .zip: the pictures of a submission to the challenge; a .json appears beside it",
+            ".npy to write, with a .json beside it; .zip: a submission to the challenge",
             short="o",
         ),
     ]
     method: Annotated[
         Text,
         setting(
-            "classical method, shipped weights, weights file or run folder; auto: mergenet, or the classical method "
-            "that was measured to be better at this sensor, depth and light",
+            "method, weights file or run folder; auto: what was measured to be best",
             known=method_names,
         ),
     ] = DEFAULT_METHOD

@@ -23,7 +23,6 @@ from quiver.model.names import NETWORKS
 from quiver.restoration.settings import method_names
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.optimiser import Kind
-from quiver.training.saving import WHEN
 
 LEVELS = 16  # of a range of light in training: from 0.3 to 100 photons they are a factor 1.47 apart
 
@@ -52,11 +51,11 @@ class Settings:
     data: Annotated[
         str | tuple[Text, ...],
         setting(
-            "data set folder, or several, whose clips count alike; for bit2bit a stored stream, or a clip with one",
+            "data set folders; for bit2bit a stored stream, or a clip with one",
             positional=True,
         ),
     ]
-    out: Annotated[str, setting(f"folder of the run; its state is {WHEN}", option="output", short="o")]
+    out: Annotated[str, setting("folder of the run", option="output", short="o")]
     network: Annotated[str, setting("network", option="preset", choices=NETWORKS)] = "mergenet"
     start: Annotated[
         Text | None,
@@ -89,7 +88,7 @@ class Settings:
     planes: Annotated[
         Frames | None,
         setting(
-            "clip frames of a code: planes that a clocked SPAD sums, slices of one exposure of other sensors",
+            "clip frames of a code: planes of a clocked SPAD, else slices of an exposure",
             unset="those of the streams, else 1",
         ),
     ] = None

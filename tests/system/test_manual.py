@@ -96,6 +96,9 @@ def test_fields_carry_the_comments_behind_them():
 # Commands and keys
 
 
+WORDS = 15  # of a line of help, at most, beside its default
+
+
 @pytest.mark.parametrize("program", [qsim.cli.program, quiver.cli.program], ids=["qsim", "quiver"])
 def test_every_option_of_every_command_is_in_the_reference(program):
     found = program.PROGRAM
@@ -105,6 +108,7 @@ def test_every_option_of_every_command_is_in_the_reference(program):
     common = (DOCS / "qsim.md").read_text(encoding="utf-8")
     for name in found.commands:
         for setting in found.declared(name).settings:
+            assert len(setting.help.split()) <= WORDS, (name, setting.name)
             if not setting.positional:
                 for option in option_names(setting):
                     where = parts[f"{found.name} {name}"]
