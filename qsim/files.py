@@ -117,10 +117,7 @@ def replacing_described(path: Path, description: Path) -> Iterator[tuple[BinaryI
 @contextlib.contextmanager
 def _replacing(*paths: Path) -> Iterator[Sequence[BinaryIO]]:
     """Open new files; at the end of the block all but the first old file are deleted and the new ones named in turn."""
-    for path in paths:
-        mode = _mode(path)
-        if mode is not None and not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-            raise ValueError(f"{path}: is a pipe or a device, not a file; name another output")
+    _refuse_pipes(paths)
     with contextlib.ExitStack() as stack:
         stack.enter_context(naming(paths[0]))
         scratch = stack.enter_context(Scratch(paths[0]))
@@ -134,13 +131,22 @@ def _replacing(*paths: Path) -> Iterator[Sequence[BinaryIO]]:
     sync_folder(paths[0].parent)
 
 
+def _refuse_pipes(paths: Sequence[Path]) -> None:
+    """Raise `ValueError` if an output is a pipe or a device, which a rename would replace."""
+    for path in paths:
+        mode = _mode(path)
+        if mode is not None and not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            raise ValueError(f"{path}: is a pipe or a device, not a file; name another output")
+
+
 @contextlib.contextmanager
 def replacing_together(*paths: Path) -> Iterator[tuple[Path, ...]]:
     """Return paths for files that describe one another, of the same names in a folder of their own.
 
     Those that the block makes appear together at its end, the descriptions last; also if this process is killed then:
-    the next command that writes there gives them their names.
+    the next command that writes there gives them their names. `ValueError` if one is a pipe or a device.
     """
+    _refuse_pipes(paths)
     with naming(paths[0]), Scratch(paths[0]) as scratch:
         place = scratch.new()
         place.mkdir()

@@ -21,7 +21,7 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -97,6 +97,10 @@ class Scratch:
         The outputs lie beside the folder, and all but the first describe those before them: old ones are deleted first,
         so that a description which exists describes what is there.
         """
+        with _alone(self._parent, len(outputs) > 1):
+            self._name(outputs)
+
+    def _name(self, outputs: Sequence[tuple[Path, Path]]) -> None:
         moves = [(str(new.relative_to(self.folder)), output.name, _state(output)) for new, output in outputs]
         if self._lock is not None and len(moves) > 1:  # one file is whole or absent without a record
             record = {"software": "qsim", "token": self.folder.name.removeprefix(PREFIX), "moves": moves}
@@ -124,6 +128,24 @@ class Scratch:
             _delete(self.folder)
         if self._lock is not None:
             os.close(self._lock)
+
+
+@contextlib.contextmanager
+def _alone(folder: Path, several: bool) -> Iterator[None]:
+    """Let one process at a time name several files in a folder: those of two writers never mix.
+
+    A file system without locks keeps them apart no more than two renames do.
+    """
+    if not several:
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        with contextlib.suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _token() -> str:
@@ -169,7 +191,8 @@ def _sweep(folder: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # an error while its writer lives
         record = os.read(lock, limits.RECORD)
         if _is_proven(folder):
-            _finish(folder, _moves_of(folder, record))
+            with _alone(folder.parent, several=True):
+                _finish(folder, _moves_of(folder, record))
             _delete(folder)
     finally:
         os.close(lock)

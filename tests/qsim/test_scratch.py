@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -142,6 +143,9 @@ def test_a_pipe_or_a_device_is_no_output(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ValueError, match="is a pipe or a device"), files.replacing(tmp_path / "pipe"):
         pass
+    several = files.replacing_together(tmp_path / "a.json", tmp_path / "pipe")
+    with pytest.raises(ValueError, match="is a pipe or a device"), several:
+        pass
     assert (tmp_path / "pipe").is_fifo()
 
 
@@ -193,3 +197,30 @@ def test_an_interruption_between_two_names_gives_both(tmp_path: Path, monkeypatc
     with pytest.raises(KeyboardInterrupt):
         write()
     assert sorted(tmp_path.iterdir()) == sorted(paths)
+
+
+def test_files_of_two_writers_never_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The second one names its files when the first has named all of its own."""
+    names = tmp_path / "a.json", tmp_path / "a.toml"
+    taken = threading.Event()
+    rename = os.replace
+    others: list[threading.Thread] = []
+
+    def slow(source: Path, target: Path) -> None:
+        rename(source, target)
+        if not others:  # after the first name of the first writer
+            others.append(threading.Thread(target=write, args=("second",)))
+            others[0].start()
+            assert not taken.wait(0.1)
+
+    def write(who: str) -> None:
+        with files.replacing_together(*names) as parts:
+            for part in parts:
+                part.write_text(who)
+        if who == "second":
+            taken.set()
+
+    monkeypatch.setattr(os, "replace", slow)
+    write("first")
+    others[0].join(10)
+    assert {name.read_text() for name in names} == {"second"}
