@@ -140,8 +140,8 @@ def _answered(program: Program, command: Command, values: Mapping[str, Any], sta
             sweep(state.target)
         with _warnings_as_lines(program.name), program.guard(command), _limited(command, state.threads):
             return int(command.run(*command.arguments(values)))
-    except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
-        if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in _PACKAGES:
+    except (ValueError, OSError, MemoryError, ImportError) as error:
+        if isinstance(error, ImportError) and _is_fault(error):
             raise
         if os.environ.get("QSIM_DEBUG") or state.printing.verbose:
             print(printable(traceback.format_exc()), end="", file=sys.stderr)
@@ -160,6 +160,14 @@ def _answered(program: Program, command: Command, values: Mapping[str, Any], sta
             spent = time.perf_counter() - started
             memory = peak_memory() / 2**30
             print(f"{program.name}: {spent:.1f} s, at most {memory:.2f} GiB of memory", file=sys.stderr)
+
+
+def _is_fault(error: ImportError) -> bool:
+    """Return whether an import failed by a fault of ours, not by a package that is missing or cannot be loaded."""
+    package = (error.name or "").split(".")[0]
+    if isinstance(error, ModuleNotFoundError):
+        return package not in _PACKAGES
+    return package in ("qsim", "quiver")
 
 
 def _then(state: Running) -> str:
@@ -243,6 +251,8 @@ def one_line(error: BaseException) -> str:
         package = (error.name or "").split(".")[0]
         extra = next((f"; the extra {name} has it" for name, (all_of, _) in OPTIONAL.items() if package in all_of), "")
         return f"needs the package {package}, which is not installed: pip install {package}{extra}"
+    if isinstance(error, ImportError):
+        return f"a library cannot be loaded ({wording(error)}); is there enough memory, and is it installed in full?"
     if isinstance(error, MemoryError):
         return f"not enough memory ({' '.join(str(error).split()) or 'none is left'}); try fewer or smaller frames"
     return wording(error)
