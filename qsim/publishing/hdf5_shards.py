@@ -12,6 +12,7 @@ from qsim.publishing.contents import Sample
 from qsim.publishing.located import COMPRESSED, Entry, Located, little, of_type
 from qsim.publishing.place import Place
 
+PACKAGES: tuple[str, ...] = ("h5py",)  # that its writer needs
 SUFFIX = "h5"
 
 

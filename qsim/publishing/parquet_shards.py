@@ -18,6 +18,7 @@ from qsim.publishing.contents import Sample
 from qsim.publishing.located import COMPRESSED, Entry, Located, little, npy_header, of_type
 from qsim.publishing.place import Place
 
+PACKAGES: tuple[str, ...] = ("pyarrow.parquet",)  # that its writer needs
 SUFFIX = "parquet"
 GROUP = 1 << 24  # bytes of a group of rows, at least: a clip that is larger has one to itself
 TEXTS = ("key", "clip", "split", "description")

@@ -164,8 +164,9 @@ class Storage:
 
     @contextlib.contextmanager
     def writing(self, name: str) -> Iterator[Path]:
-        with tempfile.TemporaryDirectory(prefix="qsim-upload-") as folder:
-            path = Path(folder) / "file"
+        # what a killed process left here is deleted by the next one
+        with scratch.Scratch(Path(tempfile.gettempdir()) / "upload") as made:
+            path = made.new()
             yield path
             with self._reaching(name):
                 system = self._system
@@ -193,14 +194,18 @@ class Storage:
 
 @functools.lru_cache(maxsize=8)
 def _system(protocol: str, process: int) -> Any:
-    """Return a file system for one process; `ModuleNotFoundError` for one whose package is missing."""
+    """Return a file system for one process; `ModuleNotFoundError` or `ValueError` where its package is missing."""
     import fsspec
 
     try:
         return fsspec.filesystem(protocol)
     except ImportError as error:
         package = getattr(error.__cause__, "name", None) or _PACKAGES.get(protocol, protocol)
-        raise ModuleNotFoundError(f"{protocol}:// needs {package}", name=package) from None
+        if package == "s3fs":
+            raise ModuleNotFoundError(f"{protocol}:// needs {package}", name=package) from None  # of our extra `s3`
+        raise ValueError(
+            f"{protocol}://: needs the package {package}, which is not installed: pip install {package}"
+        ) from None
     except ValueError:
         problem = f"{protocol}://: is not a storage that fsspec knows; name a folder, or s3://BUCKET/SET"
         raise ValueError(problem) from None

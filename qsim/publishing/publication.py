@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -214,6 +215,8 @@ def publish(
     """
     found = Source.open(Path(source), wanted or Publication())
     columns = found.columns
+    for package in MODULES[found.wanted.to].PACKAGES:
+        importlib.import_module(package)  # a missing one is named before anything is written
     chosen = found.shards if part is None else found.shards[checked_part(part)[0] - 1 :: part[1]]
     where = place(address)
     if force and part is not None:

@@ -15,6 +15,7 @@ from qsim.publishing.contents import Sample
 from qsim.publishing.located import COMPRESSED, Entry, Located, little, npy_header, of_type
 from qsim.publishing.place import Place
 
+PACKAGES: tuple[str, ...] = ()  # that its writer needs
 SUFFIX = "tar"
 LEVEL = 4  # of gzip: measured on flow and depth of `fan`, 9 takes five times as long for 1 % less
 

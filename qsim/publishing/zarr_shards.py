@@ -17,6 +17,7 @@ from qsim.publishing.contents import Sample
 from qsim.publishing.located import COMPRESSED, Entry, Located, little, of_type
 from qsim.publishing.place import Place
 
+PACKAGES: tuple[str, ...] = ("zarr",)  # that its writer needs
 SUFFIX = "zarr.zip"
 LEVEL = 4  # of gzip
 

@@ -6,6 +6,7 @@ It checks no signatures, keeps everything in memory, and is consistent at once; 
 from __future__ import annotations
 
 import contextlib
+import socket
 import threading
 import urllib.request
 from collections.abc import Iterator
@@ -32,7 +33,8 @@ class Server:
         if environ["REQUEST_METHOD"] in ("PUT", "POST") and self.uploads_left is not None:
             if self.uploads_left == 0:
                 environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0) // 2)
-                environ["werkzeug.socket"].close()  # in the middle of the body
+                environ["werkzeug.socket"].shutdown(socket.SHUT_RDWR)  # in the middle of the body
+                answer("500 Cut", [])
                 return [b""]
             self.uploads_left -= 1
         found = list(self.app(environ, answer))

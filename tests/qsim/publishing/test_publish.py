@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from clips import write_clip, write_dataset
 
 from qsim.cli.program import main
 from qsim.dataset.dataset import Dataset
-from qsim.publishing import Publication, PublishedSet, publish
+from qsim.publishing import Publication, PublishedSet, place, publish
 from qsim.publishing.publication import Source
 from qsim.streams.sensing import Sensing
 
@@ -86,6 +87,21 @@ def test_a_folder_without_permission_is_named(clip, tmp_path, capsys):
 def test_an_address_without_a_bucket_is_refused(clip):
     with pytest.raises(ValueError, match="names no bucket"):
         publish(clip.path, "s3://")
+
+
+def test_a_missing_package_is_one_sentence(clip, tmp_path, capsys, monkeypatch):
+    for package, line in {
+        "pyarrow.parquet": [str(tmp_path / "p"), "--to", "parquet"],
+        "s3fs": ["s3://bucket/set"],
+        "gcsfs": ["gs://bucket/set"],
+    }.items():
+        monkeypatch.setitem(sys.modules, package, None)
+        place._system.cache_clear()
+        assert main(["publish", str(clip.path), "-o", *line, "-q"]) == 2
+        (told,) = capsys.readouterr().err.splitlines()
+        name = package.partition(".")[0]
+        assert f"needs the package {name}, which is not installed: pip install {name}" in told
+    assert not (tmp_path / "p").exists()
 
 
 def test_a_set_that_lacks_clips_is_refused(tmp_path):
