@@ -26,7 +26,7 @@ from msgspec import Meta
 from qsim import files, records
 from qsim.checks import file_path, suggest
 from qsim.host import own_numbers
-from qsim.kinds import Seed
+from qsim.kinds import LARGEST, Seed
 
 LEAST_THRESHOLD = 0.01  # of any pixel: mismatch cannot take a threshold below it
 MODEL = "EventCamera"
@@ -34,7 +34,7 @@ MODEL = "EventCamera"
 Threshold = Annotated[float, Meta(ge=LEAST_THRESHOLD, le=20.0)]
 Spread = Annotated[float, Meta(ge=0.0, le=1.0)]
 Efficiency = Annotated[float, Meta(ge=1e-6, le=1.0)]
-Current = Annotated[float, Meta(ge=1e-3, le=1e15)]
+Current = Annotated[float, Meta(ge=1e-3, le=LARGEST)]
 Seconds = Annotated[float, Meta(ge=0.0, le=10.0)]
 Rate = Annotated[float, Meta(ge=0.0, le=1e4)]
 Cutoff = Annotated[float, Meta(ge=1e-3, le=1e9)]

@@ -130,6 +130,12 @@ def prepare(clip: ClipFolder, sensing: EventSensing) -> EventDraw:
     frames, height, width = clip.shape
     if frames < 2:
         raise ValueError(f"{clip.name}: has one frame, and events are changes between frames; give two or more")
+    missing = () if clip.info.source is None else clip.info.source.missing_frames
+    if missing:
+        raise ValueError(
+            f"{clip.name}: frame {missing[0]} was lost and is stored dark, which would be events; convert the "
+            "recording without keep_gaps=True, or with frames between, as in rate=2000"
+        )
     if max(height, width) > _WIDEST:
         raise ValueError(f"{clip.name}: {height} x {width} pixels; events name rows and columns below {_WIDEST}")
     level = light_level(clip, ppp=sensing.ppp, lux=sensing.lux, pixel_pitch=sensing.pixel_pitch)

@@ -1,7 +1,7 @@
 """Reads and writes the events of one clip: CLIP/events/NAME.npy and its description NAME.json.
 
 NAME.npy is an array [N] with the fields t (int64, us), x and y (uint16, px) and p (int8, 1 brighter, 0 darker), in the
-order of t, then y and x. Time 0 is the middle of the exposure of frame 0; frame k is at k / frame_rate. Rows and
+order of t. Time 0 is the middle of the exposure of frame 0; frame k is at k / frame_rate. Rows and
 columns are those of the clip. NAME.json is written last and holds all that the events are drawn from.
 """
 
