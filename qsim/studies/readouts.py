@@ -130,7 +130,7 @@ def _from_events(clip: Clip, stream: EventStream, instants: Sequence[int]) -> It
     contrast = np.zeros(height * width)
     seen = 0.0
     for t in instants:
-        until = (t + 0.5e-6) / clip.frame_rate  # events at the instant itself count
+        until = t / clip.frame_rate + 0.5e-6  # s; times of events are rounded to 1 us
         block = stream.between(seen, until)
         seen = until
         pixels = block["y"].astype(np.int64) * width + block["x"]
