@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
-import tempfile
 import warnings
-import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -29,6 +26,7 @@ from qsim.scene.animated.gltf_scene import cameras_in
 from qsim.scene.camera_path import read_camera_path
 from qsim.scenes.colours import coloured
 from qsim.streams.clip import Clip
+from qsim.temporary_folder import TemporaryFolder
 
 
 @own_numbers
@@ -219,25 +217,3 @@ def in_bands(scene: Scene, bands: Literal["rgb"] | None) -> Scene:
     if bands is None:
         return scene
     return coloured(scene)
-
-
-class TemporaryFolder:
-    """A folder that is deleted with the last object that refers to it, in the process that made it.
-
-    Copies of an object refer to the same folder. One that was pickled uses it as long as those of the process do.
-    """
-
-    def __init__(self) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix="qsim-"))
-        weakref.finalize(self, _delete, self.path, os.getpid())
-
-    def __copy__(self) -> TemporaryFolder:
-        return self
-
-    def __deepcopy__(self, known: dict[int, object]) -> TemporaryFolder:
-        return self
-
-
-def _delete(path: Path, owner: int) -> None:
-    if os.getpid() == owner:  # a forked worker has its copy of every object
-        shutil.rmtree(path, ignore_errors=True)

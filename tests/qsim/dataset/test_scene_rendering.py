@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from qsim import scenes
-from qsim.dataset.scene_rendering import SIDE, TemporaryFolder, load_scene, render
+from qsim.dataset.scene_rendering import SIDE, load_scene, render
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
 from qsim.rendering.budget import Budget
 from qsim.rendering.render_settings import RenderSettings
 from qsim.scene import Spin, Translation
 from qsim.scene.camera_path import write_camera_path
+from qsim.temporary_folder import TemporaryFolder
 
 QUICK = {"frames": 2, "height": 12, "width": 14, "budget": Budget(samples=8, bounces=2)}
 
