@@ -139,6 +139,8 @@ def light_recording(
 ) -> Recording:
     """Return a recording of light; `full` is the largest value of the file's pixels, infinite for floats."""
     white, assumed = white_of(path, hints, full)
+    if hints.black is not None and white is not None and hints.black >= white:
+        raise ValueError(f"{path}: black={hints.black:g}: expected less than the white, {white:g}")
     if hints.black is not None:
         marked = _without_black(path, marked, hints.black, source.transfer, full)
         source = replace(source, black=hints.black)
@@ -147,17 +149,13 @@ def light_recording(
 
 
 def _without_black(path: Path, marked: Marked, black: float, transfer: str, full: float) -> Marked:
-    """Return linear light without the pixel value of darkness; what was darker becomes 0.
+    """Return linear light without that of the pixel value of darkness; what was darker becomes 0.
 
     Pixels of whole numbers, of which `full` is the largest, are light of 0 ... 1 again; floats keep their unit.
     """
-    if transfer != "linear":
-        raise ValueError(f"{path}: black= acts on linear pixels, and transfer= is {transfer}; leave it out")
-    if not black < full:
-        raise ValueError(f"{path}: black={black:g}: expected less than the largest value {full:g}")
     floats = full == float("inf")
-    dark = np.float32(black if floats else black / full)
-    gain = np.float32(1.0 if floats else full / (full - black))
+    dark = np.float32(black if floats else to_linear(np.array(black), transfer, full))
+    gain = np.float32(1.0 if floats else 1 / (1 - dark))
 
     def subtracted(start: int, stop: int) -> tuple[Array, Array]:
         light, mask = marked(start, stop)
