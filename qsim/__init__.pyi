@@ -4,6 +4,7 @@ from .clip.clip_info import ClipInfo as ClipInfo
 from .clip.writer import ClipWriter as ClipWriter
 from .dataset.dataset import Dataset as Dataset
 from .dataset.scene_rendering import render as render
+from .formats.importing import from_video as from_video
 from .keys import Key as Key
 from .optics.camera import Camera as Camera
 from .optics.radiometry import expected_photons as expected_photons

@@ -42,7 +42,7 @@ OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
         ("torch", "safetensors", "tensorboard"),
         "quiver: restoring, training, evaluating",
     ),
-    "video": (("av",), "video files: qsim convert, qsim preview"),
+    "video": (("av", "cv2"), "video files: qsim convert, qsim preview; frames between frames: qsim convert --rate"),
     "formats": (("zarr", "h5py"), "Zarr and HDF5 files: qsim convert, qsim calibrate"),
     "publish": (("pyarrow", "fsspec"), "qsim publish: Parquet, and addresses as s3://"),
     "s3": (("s3fs",), "published sets at s3://"),
@@ -51,6 +51,7 @@ OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
     "cluster": (("distributed",), "qsim generate --cluster"),
     "denoise": (("pyoidn",), "fewer samples at the same error: qsim render, qsim generate"),
 }
+INSTALLED_AS = {"cv2": "opencv-python-headless"}  # package -> its name in the index, where it is another
 _PACKAGES = {package for packages, _ in OPTIONAL.values() for package in packages}
 
 quiet: ContextVar[bool] = ContextVar("quiet", default=False)  # of the running command
@@ -250,7 +251,8 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, ModuleNotFoundError):
         package = (error.name or "").split(".")[0]
         extra = next((f"; the extra {name} has it" for name, (all_of, _) in OPTIONAL.items() if package in all_of), "")
-        return f"needs the package {package}, which is not installed: pip install {package}{extra}"
+        name = INSTALLED_AS.get(package, package)
+        return f"needs the package {name}, which is not installed: pip install {name}{extra}"
     if isinstance(error, ImportError):
         return f"a library cannot be loaded ({wording(error)}); is there enough memory, and is it installed in full?"
     if isinstance(error, MemoryError):

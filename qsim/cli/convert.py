@@ -16,7 +16,7 @@ from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
 from qsim.formats.recording import Hints, Recording
 from qsim.formats.summing import sum_planes, summed
-from qsim.kinds import Positive, Split, Text, Whole
+from qsim.kinds import FrameRate, Positive, Split, Text, Whole
 from qsim.plane_sums import AS_STORED, PlaneSums
 from qsim.restored_video import describes_restored
 from qsim.settings import setting, settings_of
@@ -41,6 +41,14 @@ class Convert:
     ]
     frame_rate: Annotated[
         Positive | None, setting("frames per second of the capture (not of a video file)", section=Hints.SECTION)
+    ] = None
+    rate: Annotated[
+        FrameRate | None,
+        setting(
+            "frames per second of the clip: those between the frames of a video are estimated by optical flow",
+            unset="frames as they are",
+            section=Hints.SECTION,
+        ),
     ] = None
     exposure: Annotated[
         Positive | None, setting("seconds of light per frame", unset="the full frame time", section=Hints.SECTION)
@@ -144,7 +152,7 @@ _STATED = tuple(one.name for one in settings_of(Hints) if one.name not in ("tran
 IDLE = (
     Idle(
         lambda asked, *_: f"{asked.input} is ours and states it" if asked.is_ours else "",
-        ("frame_rate", "exposure", "sensor", "ppp", "split", *_STATED),
+        ("frame_rate", "rate", "exposure", "sensor", "ppp", "split", *_STATED),
     ),
     Idle(
         lambda asked, *_: (
@@ -165,6 +173,7 @@ IDLE = (
     "qsim convert ball.npy out/ball --frame-rate 30000 --exposure 20e-6 --transfer linear",
     "qsim convert camera.tif out/camera --frame-rate 1000 --transfer linear --white 4095",
     "qsim convert I2-2000FPS/test out/i2_test --frame-rate 2000 --transfer 'gamma 2.2' --split test",
+    "qsim convert phone.mp4 out/phone --rate 2000",
     "qsim convert capture.bin out/capture --layout swissspad2-half --frame-rate 96800",
     "qsim convert out/capture.npy out/capture_7 --planes 7 --from 1000 --until 8000",
     "qsim convert out/starter out/starter_mp4 --to mp4",
@@ -277,8 +286,11 @@ def _import(asked: Convert, hints: Hints, sums: PlaneSums) -> list[tuple[Path, s
     made = []
     with bar("converting") as progress:
         for source, target in pairs or [(asked.input, asked.output)]:
-            recording = importing.read(source, hints)
-            rate = frame_rate or recording.frame_rate
+            if asked.rate is None:
+                recording = importing.read(source, hints)
+            else:
+                recording = importing.read_at_rate(source, hints, asked.rate, frame_rate)
+            rate = asked.rate or frame_rate or recording.frame_rate
             if rate is None:
                 raise ValueError(f"{asked.input}: files do not state the capture rate; add --frame-rate, as in 2000")
             capture = importing.Import(rate, exposure, asked.sensor, asked.ppp, asked.split)

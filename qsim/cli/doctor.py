@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from typing import Annotated, Any
 
 from qsim.cli.command import command
-from qsim.cli.console import OPTIONAL, output
+from qsim.cli.console import INSTALLED_AS, OPTIONAL, output
 from qsim.settings import setting
 
 
@@ -51,7 +51,8 @@ def doctor(asked: Doctor) -> int:
 def _extra_text(extra: str, missing: list[str]) -> str:
     """Return what an extra is for, and how to install the packages of it that are missing."""
     purpose = OPTIONAL[extra][1]
-    return f"MISSING (pip install {' '.join(missing)}); for {purpose}" if missing else f"installed; for {purpose}"
+    names = [INSTALLED_AS.get(package, package) for package in missing]
+    return f"MISSING (pip install {' '.join(names)}); for {purpose}" if missing else f"installed; for {purpose}"
 
 
 def _device_text(device: dict[str, Any]) -> str:

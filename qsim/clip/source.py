@@ -19,6 +19,8 @@ class Source:
     transfer: str = ""  # curve of the light in its pixels
     black: Number | None = None  # pixel value without light that was subtracted
     scale: Positive | None = None  # light of the clip over that of the file, where half floats could not hold it
+    taken_rate: Positive | None = None  # frames per second that were taken; those between them are estimated
+    estimator: str = ""  # of the light between frames
     missing_frames: tuple[Count, ...] = ()  # that the recording lost and the clip marks as unknown
     bit_order: str = ""  # the bit of a byte that is the first pixel: msb, lsb, or in words
     orientation: str = ""  # of the rows and columns as they were stored, and how they were turned

@@ -10,6 +10,7 @@ The order of bits and the orientation follow from the layout; assumptions are st
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import Any, cast
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import scratch
+from qsim import files, scratch
 from qsim.checks import ArgumentError, file_path
 from qsim.clip import exr
 from qsim.clip.clip_info import ClipInfo, Saturation
@@ -27,8 +28,10 @@ from qsim.clip.source import Source
 from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
 from qsim.formats import gaps
+from qsim.formats.between_frames import at_rate
 from qsim.formats.detection import ASSUMED, LAYOUTS, detect
 from qsim.formats.recording import Hints, Marked, Recording, reoriented, with_stated_layout
+from qsim.host import own_numbers
 from qsim.kinds import Split
 from qsim.plane_sums import AS_STORED, PlaneSums, within_sum
 from qsim.sensor import colour_filter, devices, packing
@@ -40,12 +43,16 @@ from qsim.sensor.spad import BinarySPAD
 from qsim.streams.clip import Clip
 from qsim.streams.stream import Stream, is_stream, write_packed
 from qsim.streams.stream_info import StreamInfo
+from qsim.temporary_folder import TemporaryFolder
 
 
-def read(path: Path | str, hints: Hints | None = None, *, compared: tuple[str, ...] = ()) -> Recording:
+def read(
+    path: Path | str, hints: Hints | None = None, *, compared: tuple[str, ...] = (), timed: bool = False
+) -> Recording:
     """Open a foreign file or folder; frames are read on demand.
 
-    `ValueError` for a hint without effect on this file, except those that the caller `compared` with it.
+    Lost frames and uneven times are told, unless the caller takes frames at their times (`timed`). `ValueError` for a
+    hint without effect on this file, except those that the caller `compared` with it.
     """
     path = file_path(path)
     hints = hints or Hints()
@@ -56,14 +63,62 @@ def read(path: Path | str, hints: Hints | None = None, *, compared: tuple[str, .
         raise FileNotFoundError(f"{path}: no such file")
     asked = {"layout", "flip", "columns", *compared}
     recording = LAYOUTS[layout](path, cast(Hints, _Watched(hints, asked)))
-    asked |= {"keep_gaps"} if recording.times is not None else set()
+    asked |= {"keep_gaps"} if recording.times is not None and not timed else set()
     for field in fields(Hints):
         given = getattr(hints, field.name) != field.default
         if given and field.name not in asked:
             raise ValueError(f"{path}: {field.name}= changes nothing for {recording.format}; leave it out")
     if layout in ASSUMED:
         recording = with_stated_layout(recording, *ASSUMED[layout])
-    return gaps.told(path, reoriented(recording, hints), hints.keep_gaps)
+    turned = reoriented(recording, hints)
+    return turned if timed else gaps.told(path, turned, hints.keep_gaps)
+
+
+def read_at_rate(path: Path | str, hints: Hints, rate: float, frame_rate: float | None = None) -> Recording:
+    """Open a foreign file of light with frames at an even `rate` [1/s], those between its own estimated.
+
+    Its frames are at the times that it states, or with `frame_rate` evenly. The curve of a video is sRGB unless `hints`
+    states another. Errors as of `read` and `between_frames.at_rate`.
+    """
+    path = file_path(path)
+    if hints.transfer is None and (hints.layout or detect(path, hints)) == "video":
+        hints = replace(hints, transfer="srgb")
+    return at_rate(path, read(path, hints, timed=frame_rate is None), rate, frame_rate)
+
+
+@own_numbers
+def from_video(  # noqa: PLR0913 (settings of a public function)
+    video: str | os.PathLike[str],
+    path: str | os.PathLike[str] | None = None,
+    *,
+    rate: float,
+    frame_rate: float | None = None,
+    transfer: str = "srgb",
+    black: float | None = None,
+    white: float | None = None,
+    split: Split | None = None,
+    progress: Progress | None = None,
+    force: bool = False,
+) -> Clip:
+    """Return the clip of a video at `rate` frames per second; those between its own are estimated by optical flow.
+
+    Its frames are at the times that the file states, or at `frame_rate`: of a slow-motion film that is the rate of its
+    capture. `transfer` is the curve of its light, `black` the pixel value of darkness and `white` that of saturation.
+    The light is relative and luminance alone. `path` is the folder of the clip; without it, the clip lies in a
+    temporary folder that is deleted after its last use. `progress(done, frames)` is called as frames are written.
+    `ValueError`, `FileNotFoundError` or `FileExistsError` where the arguments do not fit.
+
+        clip = qsim.from_video("phone.mp4", rate=2000)
+    """
+    if path is None and force:
+        raise ValueError("force= replaces the clip of a folder, and no path is given; leave it out")
+    recording = read_at_rate(Path(video), Hints(transfer=transfer, black=black, white=white), rate, frame_rate)
+    temporary = TemporaryFolder() if path is None else None
+    stem = Path(video).stem
+    name = stem if files.NAME.fullmatch(stem) else "video"
+    target = temporary.path / name if temporary else Path(path or "")
+    clip = to_clip(recording, target, Import(rate, split=split), force=force, progress=progress)
+    return replace(clip, keeps=temporary)
 
 
 @dataclass(frozen=True)

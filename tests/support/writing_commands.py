@@ -20,6 +20,7 @@ LINES = {  # what writes -> what it reads
     **{f"qsim convert clip/events/e.json e.{kind}": ("clip",) for kind in ("h5", "npz")},
     "qsim convert codes.npy c --layout codes --bits 3 --frame-rate 9": ("codes.npy",),
     "qsim convert light.npy c --transfer linear --frame-rate 9": ("light.npy",),
+    "qsim convert light.npy c --transfer linear --frame-rate 9 --rate 18": ("light.npy",),
     **{f"qsim convert clip e --to {kind}": ("clip",) for kind in ("png", "exr", "nerfstudio", "zarr")},
     **{f"qsim convert clip/streams/b.json e --to {kind}": ("clip",) for kind in ("cube", "spike")},
     "qsim convert clip/streams/f.json e --to photons": ("clip",),

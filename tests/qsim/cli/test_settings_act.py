@@ -300,6 +300,7 @@ COMMANDS = Commands(
         "publish.shard": "2/2",
         "publish.shard_size": "1e-6",
         "px": "3",
+        "rate": "18",
         "replay": "clip:2",
         "report.output": "other.html",
         "row_delay": "2e-6",
