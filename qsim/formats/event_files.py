@@ -56,21 +56,18 @@ def _write_hdf5(stream: EventStream, path: Path) -> None:
             name: file.create_dataset(f"events/{name}", (len(array),), kind, **packed)
             for name, kind in _COLUMNS.items()
         }
+        firsts: list[Array] = []
+        until = 0  # ms, whose first events are known
         for start in range(0, len(array), BLOCK):
             block = array[start : start + BLOCK]
             for name, column in columns.items():
                 column[start : start + len(block)] = block[name]
-        file["ms_to_idx"] = milliseconds(array)
+            last = int(block["t"][-1]) // 1000 + 1
+            firsts.append(start + np.searchsorted(block["t"], 1000 * np.arange(until, last)))
+            until = max(until, last)
+        firsts.append(np.full(2 if until == 0 else 1, len(array)))
+        file["ms_to_idx"] = np.concatenate(firsts).astype(np.uint64)
         file["t_offset"] = np.int64(0)
-
-
-def milliseconds(array: Array) -> Array:
-    """Return the number of the first event with t >= 1000 m, for each m up to the last event, uint64 [M].
-
-    Where no event follows it is the number of events.
-    """
-    last = int(array["t"][-1]) if len(array) else 0
-    return np.searchsorted(array["t"], 1000 * np.arange(last // 1000 + 2)).astype(np.uint64)
 
 
 def _write_npz(stream: EventStream, path: Path) -> None:

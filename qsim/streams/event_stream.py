@@ -7,6 +7,8 @@ columns are those of the clip. NAME.json is written last and holds all that the 
 
 from __future__ import annotations
 
+import bisect
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,6 +24,7 @@ from qsim.files import VERSION, Progress
 from qsim.host import own_numbers
 from qsim.kinds import Count, Digest, Positive, Text, Whole
 from qsim.sensor.event_camera import EventCamera, from_dict
+from qsim.stored_array import StoredArray
 from qsim.streams.stream_info import StreamLight
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
@@ -116,23 +119,27 @@ class EventStream:
         return from_dict(self.info.camera, f"{self.path.with_suffix('.json')}: camera")
 
     @cached_property
-    def array(self) -> Array:
-        """All events as a memory map [N] with the fields t, x, y and p; `ValueError` if the file does not fit."""
+    def array(self) -> StoredArray:
+        """All events [N] with the fields t, x, y and p, read when they are used: `array[:1000]["t"]`.
+
+        `ValueError` if the file does not fit its description.
+        """
         if not self.path.is_file():
             raise FileNotFoundError(f"{self.path}: no such file, but its json exists; draw the events again")
-        opening.regular(self.path, beside=self.path.parent)
-        expected = _HEADER + len(self) * EVENT.itemsize
-        size = self.path.stat().st_size
-        if size != expected:
-            raise ValueError(f"{self.path}: has {size} bytes, and {len(self)} events take {expected}; {_DAMAGED}")
-        if not len(self):
-            return np.empty(0, EVENT)
-        return np.memmap(self.path, EVENT, "r", _HEADER, (len(self),))
+        with opening.opened(self.path, beside=self.path.parent) as file:
+            size = os.fstat(file.fileno()).st_size
+            expected = _HEADER + len(self) * EVENT.itemsize
+            if size != expected:
+                raise ValueError(f"{self.path}: has {size} bytes, and {len(self)} events take {expected}; {_DAMAGED}")
+            return StoredArray(self.path, os.dup(file.fileno()), _HEADER, (len(self),), EVENT, fortran=False)
 
     def between(self, start: float, stop: float) -> Array:
         """Return the events [n] with start <= t < stop, in s from the middle of the first frame."""
-        first, last = np.searchsorted(self.array["t"], [start * 1e6, stop * 1e6])
-        return np.asarray(self.array[first:last])
+        return self.array[self._first(start * 1e6) : self._first(stop * 1e6)]
+
+    def _first(self, microseconds: float) -> int:
+        """Return the number of the first event at a time or after it."""
+        return bisect.bisect_left(range(len(self)), microseconds, key=lambda n: float(self.array[n]["t"]))
 
     def verify(self, progress: Progress | None = None) -> list[str]:
         """Return one message per file whose checksum differs; empty if the events are intact."""

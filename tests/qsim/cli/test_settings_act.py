@@ -453,6 +453,7 @@ def test_a_command_prints_an_object_for_programs(line, work, tmp_path, capsys, m
 
 @pytest.mark.parametrize(("setting", "situations", "everywhere"), list(COMMANDS.cases()))
 @pytest.mark.filterwarnings("ignore:gaps. numbers in the names")
+@pytest.mark.filterwarnings("ignore:between frames")  # --rate of frames that are noise
 def test_a_setting_acts_or_is_refused(setting, situations, everywhere, work, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(look.time, "sleep", print)
     Bench(COMMANDS, work, tmp_path, capsys, monkeypatch).check(setting, situations, everywhere)

@@ -115,7 +115,8 @@ def test_what_has_no_events_is_refused(tmp_path):
         relative.sense_events("dvs")
 
 
-def test_files_have_the_layouts_of_event_tools(clip, tmp_path):
+def test_files_have_the_layouts_of_event_tools(clip, tmp_path, monkeypatch):
+    monkeypatch.setattr("qsim.formats.event_files.BLOCK", 97)
     stream = clip.event_stream("noisy")
     assert main(["convert", str(stream.path), str(tmp_path / "e.h5"), "-q"]) == 0
     assert main(["convert", str(stream.path.with_suffix(".json")), str(tmp_path / "e.npz"), "-q"]) == 0
