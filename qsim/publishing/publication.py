@@ -36,12 +36,13 @@ from qsim.publishing.record import (
     OURS,
     SET,
     Kind,
-    Places,
     SetInfo,
     ShardRecord,
     ShardSummary,
     load,
     loaded,
+    place_lines,
+    places_name,
     store,
 )
 from qsim.publishing.statistics import Statistics, statistics_of
@@ -326,12 +327,14 @@ def _write_shard(where: Place, source: Source, shard: Shard, columns: Sequence[s
                 count(position - shard.start + 1)
         size = path.stat().st_size
         sha256 = files.sha256(path)
-    store(where, f"places/{shard.name}.json", Places(digest=source.digest, clips=tuple(entries)))
+    places, line = place_lines(entries)
+    write(where, places_name(file), places)
     record = ShardRecord(
         digest=source.digest,
         file=file,
         size=size,
         sha256=sha256,
+        line=line,
         split=shard.split,  # type: ignore[arg-type]
         statistics=statistics,
     )
@@ -388,7 +391,13 @@ def _describe(source: Source, complete: Mapping[str, ShardRecord]) -> SetInfo:
     shards: dict[Any, list[ShardSummary]] = {}
     for shard in source.shards:
         record = complete[shard.name]
-        summary = ShardSummary(file=record.file, clips=shard.stop - shard.start, size=record.size, sha256=record.sha256)
+        summary = ShardSummary(
+            file=record.file,
+            clips=shard.stop - shard.start,
+            size=record.size,
+            sha256=record.sha256,
+            line=record.line,
+        )
         shards.setdefault(shard.split, []).append(summary)
     return SetInfo(
         name=source.name,

@@ -16,7 +16,7 @@ from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from qsim.optics.radiometry import Crop, check_crop
 from qsim.publishing.contents import CHANNELS
 from qsim.publishing.located import Entry, Located
 from qsim.publishing.place import Place, is_address, place
-from qsim.publishing.record import CURE, SET, Places, SetInfo, ShardSummary, load, reader_of
+from qsim.publishing.record import CURE, SET, SetInfo, ShardSummary, load, read_place, reader_of
 from qsim.sensor import packing
 from qsim.streams.clip import Clip
 from qsim.streams.event_stream import EventStream
@@ -47,7 +47,6 @@ from qsim.streams.stream_info import StreamInfo
 BLOCK = 16  # frames that are read from a remote shard at a time
 KEPT = 1 << 27  # bytes of blocks and arrays that stay in memory, of a process
 PIECE = 1 << 22  # bytes that are read at once of a shard that is checked
-SHARDS = 64  # whose places stay in memory
 
 
 def is_published(path: str | os.PathLike[str]) -> bool:
@@ -127,22 +126,7 @@ class PublishedSet:
         number = bisect_right(self._ends[split], position)
         shard = self.info.shards[split][number]
         before = self._ends[split][number - 1] if number else 0
-        entry = _places(self.address, _places_name(shard.file), self.info.digest).clips[position - before]
-        return PublishedClip.of(self, shard, entry)
-
-
-def _places_name(file: str) -> str:
-    """Return the name of the places of a shard's clips."""
-    return f"places/{Path(file).name.partition('.')[0]}.json"
-
-
-@lru_cache(maxsize=SHARDS)
-def _places(address: str, name: str, digest: str) -> Places:
-    """Return the places of a shard's clips; `ValueError` for those of another set."""
-    found = load(place(address), name, Places)
-    if found.digest != digest:
-        raise ValueError(f"{address}/{name}: belongs to another published set; {CURE}")
-    return found
+        return PublishedClip.of(self, shard, read_place(self.where, shard, position - before))
 
 
 @dataclass(frozen=True, eq=False)

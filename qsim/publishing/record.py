@@ -9,11 +9,13 @@ published.json              the set; written at the very end
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-from qsim import descriptions, files
+from qsim import descriptions, files, records
 from qsim.kinds import Count, Digest, Split, Text, text_like
 from qsim.parsing import parse_json
 from qsim.publishing import hdf5_shards, parquet_shards, tar_shards, zarr_shards
@@ -33,22 +35,13 @@ CARD = "README.md"
 CROISSANT = "croissant.json"
 OTHERS = (
     r"published\.json|README\.md|croissant\.json|LICEN[CS]E[A-Za-z0-9._-]*|pictures/[A-Za-z0-9._-]+\.png"
-    r"|(places|records)/(train|val|test)-[0-9]{5,}\.json"
+    r"|places/(train|val|test)-[0-9]{5,}\.jsonl|records/(train|val|test)-[0-9]{5,}\.json"
 )
 SHARD = r"shards/(train|val|test)-[0-9]{5,}\.(tar|parquet|h5|zarr\.zip)"
 ShardFile = Annotated[str, text_like(SHARD, "a name as shards/train-00000.tar")]
 OURS = rf"{OTHERS}|{SHARD}"
 CURE = "publish the set again with force=True"
 Made = TypeVar("Made")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Places:
-    """Where the clips of a shard lie."""
-
-    FORMAT: ClassVar[str] = "places of published clips"
-    digest: Digest  # of what is published
-    clips: tuple[Entry, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +53,7 @@ class ShardRecord:
     file: ShardFile
     size: Count  # bytes
     sha256: Digest
+    line: Count  # bytes of a line of its places
     split: Split
     statistics: Statistics
 
@@ -72,6 +66,7 @@ class ShardSummary:
     clips: Count
     size: Count
     sha256: Digest
+    line: Count
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +84,26 @@ class SetInfo:
     shards: dict[Split, tuple[ShardSummary, ...]] = field(default_factory=dict)
     alike: dict[Split, tuple[Count, ...]] = field(default_factory=dict)  # positions of clips that stand for all
     software: dict[str, str] = field(default_factory=lambda: {"qsim": files.VERSION})
+
+
+def places_name(file: str) -> str:
+    """Return the name of the places of a shard's clips."""
+    return f"places/{Path(file).name.partition('.')[0]}.jsonl"
+
+
+def place_lines(entries: Sequence[Entry]) -> tuple[bytes, int]:
+    """Return the places of clips, and the bytes of one of their lines."""
+    lines = [json.dumps(records.plain(entry), sort_keys=True, separators=(",", ":")).encode() for entry in entries]
+    width = max(map(len, lines)) + 1
+    return b"".join(line.ljust(width - 1) + b"\n" for line in lines), width
+
+
+def read_place(where: Place, shard: ShardSummary, number: int) -> Entry:
+    """Return where clip `number` of a shard lies; `ValueError` for a damaged line."""
+    name = places_name(shard.file)
+    shown = Path(where.address) / name
+    line = where.read(name, number * shard.line, (number + 1) * shard.line)
+    return records.convert(parse_json(shown, line.decode("utf-8", "replace")), Entry, str(shown), cure=CURE)
 
 
 def reader_of(kind: str) -> ShardReader:
