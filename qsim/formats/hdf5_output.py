@@ -14,10 +14,12 @@ from typing import Any, BinaryIO
 
 
 class _Output(io.RawIOBase):
-    """A file, as HDF5 sees it: no write fails. What a full disk did not take is kept in memory, for HDF5 to close."""
+    """A file, as HDF5 sees it: no write fails, and no Ctrl-C ends one. What is written after either is kept in memory,
+    for HDF5 to close.
+    """
 
     def __init__(self, file: BinaryIO) -> None:
-        self.error: OSError | None = None  # the first one
+        self.error: BaseException | None = None  # the first one
         self._descriptor = file.fileno()
         self._place = 0
         self._size = 0
@@ -32,6 +34,15 @@ class _Output(io.RawIOBase):
         return self._place
 
     def write(self, content: Any) -> int:
+        place = self._place
+        try:
+            return self._write(content)
+        except BaseException as error:  # a signal
+            self.error = self.error or error
+            self._place = place
+            return self._write(content)
+
+    def _write(self, content: Any) -> int:
         rest = memoryview(content).cast("B")
         total = len(rest)
         while len(rest):
@@ -44,7 +55,7 @@ class _Output(io.RawIOBase):
         if self.error is None:
             try:
                 done = os.pwrite(self._descriptor, rest, self._place)
-            except OSError as error:
+            except BaseException as error:
                 self.error = error
         if self.error is not None:
             done = len(rest)
@@ -71,14 +82,17 @@ class _Output(io.RawIOBase):
         if self.error is None:
             try:
                 os.truncate(self._descriptor, self._size)
-            except OSError as error:
+            except BaseException as error:
                 self.error = error
         return self._size
 
 
 @contextlib.contextmanager
 def writable(file: BinaryIO) -> Iterator[tuple[Any, Callable[[], None]]]:
-    """Return an open `h5py.File` that is written to a file, and a function that raises the error of a full disk."""
+    """Return an open `h5py.File` that is written to a file, and a function that raises what its writing met.
+
+    That is the `OSError` of a full disk, or the `KeyboardInterrupt` of a signal.
+    """
     import h5py
 
     output = _Output(file)

@@ -56,3 +56,21 @@ def test_a_full_disk_at_any_byte_is_an_error(room, tmp_path, monkeypatch):
     elif room > TAKEN[1]:
         write(path)
         assert h5py.is_hdf5(path)
+
+
+@pytest.mark.parametrize("at", range(4))
+def test_a_signal_while_hdf5_writes_ends_the_block(at, tmp_path, monkeypatch):
+    """Raised inside of the library, it would be lost in one that says nothing."""
+    pwrite = os.pwrite
+    calls = 0
+
+    def interrupted(descriptor: int, content: memoryview, place: int) -> int:
+        nonlocal calls
+        calls += 1
+        if calls == at + 1:
+            raise KeyboardInterrupt
+        return pwrite(descriptor, content, place)
+
+    monkeypatch.setattr(os, "pwrite", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "a.h5")
