@@ -35,6 +35,9 @@ def frames_of(path: Path, hints: Hints) -> Stack:
 
     with decoding_errors(path, "TIFF"), tifffile.TiffFile(opening.regular(path)) as opened:
         count = len(opened.pages)  # the library refuses a chain of pages in a circle
+        promised = count * _bytes_of(opened.pages.first)  # pages may name the same bytes
+        if promised > limits.DEFLATED * path.stat().st_size:
+            raise ValueError(f"{path}: {count} pages state {promised} bytes, the file has {path.stat().st_size}")
         own = not (opened.is_ome or opened.is_micromanager)  # these name further files, which are not opened
         if opened.is_shaped or (opened.is_imagej and own):
             frame = math.prod(opened.pages.first.shape)
@@ -70,12 +73,17 @@ def _axes(opened: Any, count: int) -> tuple[tuple[int, ...], str]:
 def check_size_of(path: Path, page: int, found: Any) -> None:
     """Raise `ValueError` if a page states more bytes than the file can hold, or too large tiles."""
     there = path.stat().st_size
-    row_bits = found.imagewidth * found.samplesperpixel * found.bitspersample
-    promised = -(-row_bits // 8) * found.imagelength  # rows begin at a byte
+    promised = _bytes_of(found)
     if promised > limits.DEFLATED * there or (found.compression == 1 and promised > there):
         raise ValueError(f"{path}: page {page} states {promised} bytes, the file has {there}")
     if float(np.prod(found.chunks, dtype=float)) > max(limits.PIXELS, 4 * found.imagelength * found.imagewidth):
         raise ValueError(f"{path}: page {page} is stored in tiles of {list(found.chunks)} pixels, too large to read")
+
+
+def _bytes_of(found: Any) -> int:
+    """Return the bytes of the pixels of a page, whose rows begin at a byte."""
+    row_bits = found.imagewidth * found.samplesperpixel * found.bitspersample
+    return int(-(-row_bits // 8) * found.imagelength)
 
 
 def decoded(path: Path, page: int, found: Any) -> Array:

@@ -247,3 +247,21 @@ def test_tiff_that_needs_a_decoder_names_its_package(tmp_path: Path, monkeypatch
     found = recording(tmp_path / "a.tif", Hints(transfer="linear"))
     np.testing.assert_allclose(found.read(0, 1)[0], pixels / 4095, rtol=1e-6)
     monkeypatch.setitem(sys.modules, "imagecodecs", None)
+
+
+def test_pages_of_one_strip_are_refused(tmp_path):
+    """A file of 60 kB with 400 pages of the same bytes stated 100 MB."""
+    tifffile = pytest.importorskip("tifffile")
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.zeros((512, 512), np.uint8), compression="zlib", photometric="minisblack")
+    content = path.read_bytes()
+    (start,) = struct.unpack_from("<I", content, 4)
+    (tags,) = struct.unpack_from("<H", content, start)
+    page = content[start : start + 2 + 12 * tags]
+    pages = [len(content) + number * (len(page) + 4) for number in range(400)]
+    chain = b"".join(page + struct.pack("<I", after) for after in [*pages[1:], 0])
+    path.write_bytes(
+        content[: start + len(page)] + struct.pack("<I", pages[0]) + content[start + len(page) + 4 :] + chain
+    )
+    with pytest.raises(ValueError, match=r"a\.tif: 401 pages state \d+ bytes, the file has"):
+        importing.read(path, Hints(transfer="linear"))
