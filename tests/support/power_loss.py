@@ -10,9 +10,11 @@ the new one, or zeros in its length. A rename is kept or lost as a whole.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import random
+import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +33,7 @@ class Recorder:
         self.folder = folder
         self.steps: list[Step] = []
         self._busy = False
+        self._lock = threading.RLock()
         self._known: dict[bytes, bytes] = {}
         self._fsync = os.fsync
 
@@ -40,10 +43,23 @@ class Recorder:
         os.fsync = self.sync  # type: ignore[assignment]
 
     def tree(self) -> None:
-        """Note the files."""
-        if self._busy:  # its own reading
-            return
-        self._busy = True
+        """Note the files; other threads wait with their operations."""
+        with self._lock:
+            if self._busy:  # its own reading
+                return
+            self._busy = True
+            try:
+                self.steps.append(("tree", self._files()))
+            finally:
+                self._busy = False
+
+    def _files(self) -> Tree:
+        """Return the files of the folder, again if an operation of another thread had begun before."""
+        while True:
+            with contextlib.suppress(FileNotFoundError):
+                return self._found()
+
+    def _found(self) -> Tree:
         found: Tree = {}
         for place, folders, names in os.walk(self.folder):
             for name in folders:
@@ -55,8 +71,7 @@ class Recorder:
                 status = os.lstat(path)
                 kept = self._known.setdefault(content, content)
                 found[os.path.relpath(path, self.folder)] = (status.st_ino, kept, status.st_mtime_ns)
-        self.steps.append(("tree", found))
-        self._busy = False
+        return found
 
     def sync(self, file: int) -> None:
         """Sync a file or a folder, and note it."""
