@@ -65,7 +65,7 @@ def kernels_of(filters: ColourFilter, efficiency: float) -> Array:
 
 
 def within(count: int, period: int, before: int, after: int | None = None) -> Array:
-    """Return indices of a line with more places before and, by default as many, after.
+    """Return indices [before + count + after] of a line with places before and, by default as many, after.
 
     Those outside are the nearest of their phase.
     """
