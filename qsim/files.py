@@ -338,7 +338,7 @@ def load_array(path: Path, beside: Path | None = None) -> LazyArray:
 def read_npy_header(path: Path, file: IO[bytes] | gzip.GzipFile) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Return shape, order (True: Fortran's) and type of a .npy array of numbers from a stream, up to its first value.
 
-    `ValueError` for objects, a number without axes, and versions that are not known.
+    `ValueError` for objects, a number without axes, negative sides, and versions that are not known.
     """
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
@@ -349,6 +349,8 @@ def read_npy_header(path: Path, file: IO[bytes] | gzip.GzipFile) -> tuple[tuple[
         raise ValueError(f"{path}: an array of {dtype}; numbers are expected")
     if not shape:
         raise ValueError(f"{path}: a single number without axes; an array is expected")
+    if min(shape) < 0:
+        raise ValueError(f"{path}: the header states a side of {min(shape)}; the file is damaged")
     return shape, fortran, dtype
 
 

@@ -31,7 +31,9 @@ class StoredArray(LazyArray):
         self, path: Path, descriptor: int, start: int, shape: tuple[int, ...], dtype: np.dtype[Any], *, fortran: bool
     ) -> None:
         """Take over the descriptor of a regular file whose values begin at byte `start`."""
-        self.shape, self.dtype, self.ndim = shape, dtype, len(shape)
+        self.shape = shape
+        self.dtype = dtype
+        self.ndim = len(shape)
         self._path = path
         self._descriptor = descriptor
         self._start = start

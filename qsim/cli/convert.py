@@ -45,7 +45,7 @@ class Convert:
     rate: Annotated[
         FrameRate | None,
         setting(
-            "frames per second of the clip: those between the frames of a video are estimated by optical flow",
+            "frames per second of the clip; those that a video lacks are estimated",
             unset="frames as they are",
             section=Hints.SECTION,
         ),

@@ -23,6 +23,7 @@ from quiver.model.names import NETWORKS
 from quiver.restoration.settings import method_names
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.optimiser import Kind
+from quiver.training.saving import CHECKPOINT_SECONDS
 
 LEVELS = 16  # of a range of light in training: from 0.3 to 100 photons they are a factor 1.47 apart
 
@@ -55,7 +56,10 @@ class Settings:
             positional=True,
         ),
     ]
-    out: Annotated[str, setting("folder of the run", option="output", short="o")]
+    out: Annotated[
+        str,
+        setting(f"folder of the run; its state is saved every {CHECKPOINT_SECONDS:g} s", option="output", short="o"),
+    ]
     network: Annotated[str, setting("network", option="preset", choices=NETWORKS)] = "mergenet"
     start: Annotated[
         Text | None,

@@ -232,7 +232,7 @@ MISTAKES = [
     ("qsim convert empty.npy x --frame-rate 9", "empty.npy: has no frames"),
     ("qsim convert flat.npy x --frame-rate 9", "flat.npy: expected frames [T, H, W], found an array of shape [8, 10]"),
     ("qsim convert norows.npy x --frame-rate 9", "norows.npy: frames of 0 x 10 pixels"),
-    ("qsim convert objects.npy x --frame-rate 9", "objects.npy: not readable as .npy"),
+    ("qsim convert objects.npy x --frame-rate 9", "objects.npy: an array of object; numbers are expected"),
     ("qsim convert text.txt x --frame-rate 9", "text.txt: unknown kind of file; name its --layout: cube"),
     ("qsim convert broken.png x --frame-rate 9 --transfer srgb", "broken.png: not readable as PNG"),
     ("qsim convert grey.png x --frame-rate 9", "a picture does not state its transfer curve; add --transfer 'linear'"),

@@ -9,7 +9,8 @@ ROOT = Path(__file__).parents[3]
 
 
 def test_help_and_page_state_the_interval():
-    assert WHEN in " ".join(PROGRAM.help("train").split())
+    assert f"saved every {CHECKPOINT_SECONDS:g} s" in " ".join(PROGRAM.help("train").split())
+    assert f"{CHECKPOINT_SECONDS:g} s" in WHEN
     page = " ".join((ROOT / "docs" / "training.md").read_text(encoding="utf-8").split())
     assert f"at the first validation, then every {CHECKPOINT_SECONDS:g} s, at the end, and on Ctrl-C" in page
 
