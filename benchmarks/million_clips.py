@@ -2,10 +2,11 @@
 
     python benchmarks/million_clips.py --sizes 1000,10000,100000 --out docs/results/million_clips.json
 
-A writer of tiny clips (3 frames of 8 x 8 pixels, one stream) stands in for the renderer. Beyond `--written` clips the
-others have records and descriptions of their own, and their frames and codes are links to the files of the first.
-Beyond `--described` clips they are links to the folder of the first, and `check` is left out: every clip then has two
-entries, and commands still read a full folder. Each command runs in a new process; memory is the peak of that process.
+A writer of tiny clips (3 frames of 8 x 8 pixels, one stream) stands in for the renderer. It writes a part of a thousand
+clips. The others have records and descriptions of their own, and their frames and codes are links to the files of the
+first. Of sets of more than `--described` clips only the first thousand are made so, the others are links to the folder
+of the first: every clip then has two entries, and commands read a full folder. Each command runs in a new process;
+memory is the peak of that process.
 
     one shard   one clip as task 1 of N:  qsim generate RECIPE --shard 1/N
     plan shard  the kinds of that shard, without rendering
@@ -13,6 +14,7 @@ entries, and commands still read a full folder. Each command runs in a new proce
     window      one training window, mean over 200 at random places
     check       one part of a thousand clips:  qsim check SET --shard 1/N
     resume      one part of a thousand clips, all finished
+    publish     the first thousand clips as WebDataset:  qsim publish SET -o OUT --shard 1/N
 """
 
 from __future__ import annotations
@@ -85,11 +87,11 @@ says what the bookkeeping costs, and what the clips cost.
 
 ## The bookkeeping
 
-Tiny clips of 3 frames of 8 x 8 px stand in for rendered ones. `one shard` and `plan shard` are of one clip, `check` and
-`resume` of a part of a thousand. Each ran in a process of its own, without the time of imports, on two cores that a
-dozen other programs shared.
+Tiny clips of 3 frames of 8 x 8 px stand in for rendered ones. `one shard` and `plan shard` are of one clip, `check`,
+`resume` and `publish` of a part of a thousand. Each ran in a process of its own, without the time of imports, on two
+cores that other programs shared.
 """
-PART = 1000  # clips of one part of `check` and `resume`
+PART = 1000  # clips of one part of `check`, `resume` and `publish`
 
 
 def wanted(clips: int) -> recipe.Recipe:
@@ -120,7 +122,7 @@ def make(job: Job, path: Path) -> Clip:
 def link_rest(folder: Path, clips: int, *, described_each: bool) -> None:
     """Make the other clips by links to the first: own descriptions and record, shared frames and codes.
 
-    Without `described_each` they are links to its folder, with their own records.
+    Without `described_each` only those of the first part are, and the others are links to the folder, with records.
     """
     found = wanted(clips)
     write_manifest(found, folder)
@@ -130,7 +132,7 @@ def link_rest(folder: Path, clips: int, *, described_each: bool) -> None:
     shared = [path for path in made if path.suffix != ".json"]
     described = {path: _unsealed(source / path) for path in made if path.suffix == ".json"}
     block = ""
-    for job in found.jobs:
+    for number, job in enumerate(found.jobs):
         if record_path(folder, job.key).exists():
             continue
         if job.block != block:
@@ -138,7 +140,7 @@ def link_rest(folder: Path, clips: int, *, described_each: bool) -> None:
             make_block(folder, job)
         target = folder / "clips" / job.key
         record_path(folder, job.key).write_text(json.dumps(descriptions.values_of(JobRecord.of(job))))
-        if not described_each:
+        if not described_each and number >= PART:
             target.symlink_to(source)
             continue
         target.mkdir()
@@ -179,6 +181,13 @@ def check(folder: Path, clips: int) -> None:
     assert Dataset.open(folder).verify(shard=(1, max(1, clips // PART))) == []
 
 
+def publish(folder: Path, clips: int) -> None:
+    from qsim.publishing import Publication
+    from qsim.publishing import publish as publish_part
+
+    publish_part(folder, folder.parent / "published", Publication(to="webdataset"), part=(1, max(1, clips // PART)))
+
+
 def open_windows(folder: Path, clips: int) -> None:
     import quiver
 
@@ -205,6 +214,7 @@ COMMANDS = {
     "window": window,
     "check": check,
     "resume": resume,
+    "publish": publish,
 }
 
 
@@ -262,7 +272,7 @@ def two_at_once(folder: Path, clips: int) -> dict[str, Any]:
     return {"seconds": time.perf_counter() - started, "exit_codes": codes, "problems": problems}
 
 
-def measure(clips: int, written: int, described: int, place: Path) -> dict[str, Any]:
+def measure(clips: int, described: int, place: Path) -> dict[str, Any]:
     """Return the row of one size."""
     begun = place / "begun"
     row: dict[str, Any] = {"clips": clips, "one shard": measured("one shard", begun, clips)}
@@ -270,10 +280,10 @@ def measure(clips: int, written: int, described: int, place: Path) -> dict[str, 
     row["two at once, one killed"] = two_at_once(place / "two", clips)
     folder = place / "whole"
     started = time.perf_counter()
-    generate(wanted(clips), folder, Options(workers=0, shard=(1, max(1, clips // min(clips, written)))), make=make)
-    row["writing one clip"] = {"seconds": (time.perf_counter() - started) / min(clips, written)}
+    generate(wanted(clips), folder, Options(workers=0, shard=(1, max(1, clips // PART))), make=make)
+    row["writing one clip"] = {"seconds": (time.perf_counter() - started) / PART}
     link_rest(folder, clips, described_each=clips <= described)
-    for command in ("open", "window", "resume", *(("check",) if clips <= described else ())):
+    for command in ("open", "window", "resume", "check", "publish"):
         row[command] = measured(command, folder, clips)
     return row | contents(folder)
 
@@ -297,10 +307,8 @@ def page(found: dict[str, Any]) -> str:
     more = [
         "",
         "The slope is that of seconds over clips, on logarithmic scales: 0 is constant, 1 is linear. At each size two",
-        f"tasks ran at once, and one of them was killed and started again: their files {verdict}. Clips beyond the",
-        "first hundreds are links to one clip, with records of their own. Above 10,000 they lack the descriptions that",
-        "`check` reads. When a million was measured, the locks of clips lay beside four others. They have a folder of",
-        "their own now, and no folder has more than a thousand entries.",
+        f"tasks ran at once, and one of them was killed and started again: their files {verdict}. Of sets above 10,000",
+        "clips, those beyond two thousand are links to one clip, with records of their own.",
         "",
     ]
     return "\n".join([HEAD, *markdown_table(lines, header), *more, *costs()]) + "\n"
@@ -374,8 +382,7 @@ def _cost(on: str, work: float, unit: str, machine_hours: float | None, priced: 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", default="1000,10000,100000", help="numbers of clips")
-    parser.add_argument("--written", type=int, default=1000, help="clips that are written; the others are linked")
-    parser.add_argument("--described", type=int, default=10000, help="clips with own descriptions; others are links")
+    parser.add_argument("--described", type=int, default=10000, help="most clips of a set that all are described")
     parser.add_argument("--folder", type=Path, help="place for the sets; a temporary folder by default")
     parser.add_argument("--out", type=Path, help="file of the rows")
     parser.add_argument("--command", choices=COMMANDS, help=argparse.SUPPRESS)
@@ -396,7 +403,7 @@ def main() -> None:
     rows = []
     for clips in sizes:
         with tempfile.TemporaryDirectory(dir=args.folder, prefix="million-") as place:
-            rows.append(measure(clips, args.written, args.described, Path(place)))
+            rows.append(measure(clips, args.described, Path(place)))
             print(json.dumps(rows[-1]), flush=True)
     if args.out:
         write_json(args.out, {"qsim": VERSION, "part": PART, "rows": rows})
