@@ -91,12 +91,13 @@ Tiny clips of 3 frames of 8 x 8 px stand in for rendered ones. `one shard` and `
 `resume` and `publish` of a part of a thousand. Each ran in a process of its own, without the time of imports, on two
 cores that other programs shared.
 """
+TESTED = 10  # clips, the last ones of the recipe
 PART = 1000  # clips of one part of `check`, `resume` and `publish`
 
 
 def wanted(clips: int) -> recipe.Recipe:
     """Return the recipe of so many clips, ten of them to test."""
-    return recipe.parse(RECIPE.format(last=clips - 11))
+    return recipe.parse(RECIPE.format(last=clips - TESTED - 1))
 
 
 def make(job: Job, path: Path) -> Clip:
@@ -122,7 +123,8 @@ def make(job: Job, path: Path) -> Clip:
 def link_rest(folder: Path, clips: int, *, described_each: bool) -> None:
     """Make the other clips by links to the first: own descriptions and record, shared frames and codes.
 
-    Without `described_each` only those of the first part are, and the others are links to the folder, with records.
+    Without `described_each` only those of the first part and those to test are, and the others are links to the folder,
+    with records.
     """
     found = wanted(clips)
     write_manifest(found, folder)
@@ -140,7 +142,7 @@ def link_rest(folder: Path, clips: int, *, described_each: bool) -> None:
             make_block(folder, job)
         target = folder / "clips" / job.key
         record_path(folder, job.key).write_text(json.dumps(descriptions.values_of(JobRecord.of(job))))
-        if not described_each and number >= PART:
+        if not described_each and PART <= number < clips - TESTED:
             target.symlink_to(source)
             continue
         target.mkdir()
@@ -191,7 +193,7 @@ def publish(folder: Path, clips: int) -> None:
 def open_windows(folder: Path, clips: int) -> None:
     import quiver
 
-    assert len(quiver.windows(folder, split="train", frames=3, crop=8)) == clips - 10
+    assert len(quiver.windows(folder, split="train", frames=3, crop=8)) == clips - TESTED
 
 
 def window(folder: Path, clips: int) -> dict[str, float]:
