@@ -31,7 +31,7 @@ from qsim.sensor.event_pixels import EventPixels
 from qsim.settings import given, setting, settle
 from qsim.streams.event_stream import EVENT, FOLDER, EventInfo, EventStream, write
 from qsim.streams.photons import clip_photons, light_level, light_line
-from qsim.streams.sensing import AskedLux, AskedPitch, AskedSeed
+from qsim.streams.sensing import AskedLux, AskedPitch, AskedSeed, light_name
 from qsim.streams.stream import tidy, writing
 from qsim.streams.stream_info import StreamLight
 
@@ -77,12 +77,7 @@ class EventSensing:
         """The given name, or one made of the settings: `dvs_3.25ppp`."""
         if self.name is not None:
             return check_name(self.name)
-        light = "asis"
-        if self.ppp is not None:
-            light = f"{self.ppp:g}ppp"
-        if self.lux is not None:
-            light = f"{self.lux:g}lx"
-        light = light.replace("e+", "e")  # a name holds no +
+        light = light_name(self.ppp, self.lux)
         camera = Path(self.camera_name).name.removesuffix(".toml")
         if isinstance(self.camera, EventCamera):
             camera = f"events-{files.sha256(files.to_json(self.camera.to_dict()))[:8]}"

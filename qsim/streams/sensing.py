@@ -165,12 +165,7 @@ class Sensing:
         """The given name, or one made of the settings: `quiver-physical_3bit_3.25ppp`."""
         if self.name is not None:
             return check_name(self.name)
-        light = "asis"
-        if self.ppp is not None:
-            light = f"{self.ppp:g}ppp"
-        if self.lux is not None:
-            light = f"{self.lux:g}lx"
-        light = light.replace("e+", "e")  # a name holds no +
+        light = light_name(self.ppp, self.lux)
         bits = "" if self.depth is None else f"_{self.depth}bit"
         if self.planes is not None and self.planes != 2 ** self.planes.bit_length() - 1:
             bits += f"_{self.planes}planes"
@@ -229,6 +224,16 @@ def as_summed(sensor: Sensor, sensing: Sensing) -> Sensor:
         kind = type(sensor).__name__
         raise ValueError(f"{sensing.sensor_name}: planes= is for a clocked SPAD (BinarySPAD), this is a {kind}")
     return sensor.plane.of_planes(sensing.planes)
+
+
+def light_name(ppp: float | None, lux: float | None) -> str:
+    """Return a light level as a part of a name: `3.25ppp`, `10lx`, or `asis` for the clip's own light."""
+    found = "asis"
+    if ppp is not None:
+        found = f"{ppp:g}ppp"
+    if lux is not None:
+        found = f"{lux:g}lx"
+    return found.replace("e+", "e")  # a name holds no +
 
 
 def filters_of(sensing: Sensing) -> ColourFilter | None:
