@@ -18,12 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from qsim.dataset.dataset import Dataset
 from qsim.files import VERSION, write_json
 from qsim.tables import markdown_table
 from quiver.cli import main as quiver_main
+from quiver.evaluation.metrics import over_scenes
 
 ROOT = Path(__file__).parents[1]
 ROWS = ROOT / "docs" / "results" / "colour.json"
@@ -85,8 +85,8 @@ def _difference(method: str, apart: np.ndarray) -> str:
     """Return the mean difference over scenes with its 95 % interval; empty for the control itself."""
     if method == CONTROL:
         return ""
-    half = stats.t.ppf(0.975, len(apart) - 1) * apart.std(ddof=1) / np.sqrt(len(apart))
-    return f"{apart.mean():+.2f} ± {half:.2f}"
+    found = over_scenes(apart.tolist(), range(len(apart)))
+    return f"{found.mean:+.2f} ± {found.half_width:.2f}"
 
 
 def main() -> None:

@@ -60,7 +60,8 @@ def compared(light: Array, step: int) -> list[str]:
     light = light / min(2.5 * light.mean(), light.max())
     squares: dict[str, list[float]] = {"repeated": [], "blended": [], "flow": []}
     for start in range(0, len(light) - step, step):
-        first, second = light[start], light[start + step]
+        first = light[start]
+        second = light[start + step]
         between = Between(first, second)
         for number in sorted(set(np.linspace(1, step - 1, TRIED).round().astype(int))):
             share = number / step

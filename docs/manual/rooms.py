@@ -163,7 +163,8 @@ def _curve(points: list[tuple[float, float]]) -> str:
     for to_x, to_y in more:
         middle = (y + to_y) / 2
         found.append(f"C {x:.0f} {middle:.0f} {to_x:.0f} {middle:.0f} {to_x:.0f} {to_y:.0f}")
-        x, y = to_x, to_y
+        x = to_x
+        y = to_y
     return " ".join(found)
 
 
