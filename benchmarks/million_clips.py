@@ -310,8 +310,7 @@ def page(found: dict[str, Any]) -> str:
         "",
         "The slope is that of seconds over clips, on logarithmic scales: 0 is constant, 1 is linear. At each size two",
         f"tasks ran at once, and one of them was killed and started again: their files {verdict}. Of sets above 10,000",
-        "clips, those beyond two thousand are links to one clip, with records of their own. The million was measured",
-        "before the locks of clips had a folder of their own; no folder has more than a thousand entries now.",
+        "clips, those beyond the first thousand are links to one clip, with records of their own.",
         "",
     ]
     return "\n".join([HEAD, *markdown_table(lines, header), *more, *costs()]) + "\n"
