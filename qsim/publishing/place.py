@@ -183,8 +183,8 @@ class Storage:
         """Turn errors of a storage's own kind into an `OSError` with the address."""
         try:
             yield
-        except FileNotFoundError as error:
-            raise FileNotFoundError(f"{self._path(name)}: {files.wording(error)}") from None
+        except FileNotFoundError:  # the clients' own words name a request or nothing
+            raise FileNotFoundError(f"{self._path(name)}: no such bucket or file") from None
         except Exception as error:  # clients raise errors of their own
             raise OSError(
                 f"{self._path(name)}: {files.wording(error)}; files that are there are complete, and the same command "
