@@ -67,6 +67,8 @@ def read_cube(path: Path, hints: Hints) -> Recording:
         if hints.channel is None or not 0 <= hints.channel < array.shape[3]:
             raise ValueError(f"{path}: a colour cube of {array.shape[3]} channels; choose one with channel=0")
         array = array.channel(hints.channel)
+    else:
+        hints.refuse(path, "photon cube", "channel")
     if array.dtype != np.uint8 or array.ndim != 3:
         raise ValueError(f"{path}: a photon cube is uint8 [T, H, bytes], found {array.dtype} {list(array.shape)}")
     frames, height, columns = check_shape(path, array.shape)
@@ -132,7 +134,10 @@ def codes_of(
     if reading.colour:
         raise ValueError(f"{path}: colours hold no codes; name the axis of channels C, and choose one with channel=")
     shape = check_shape(path, reading.shape(values.shape))
-    bits = 1 if values.dtype == bool else bits or hints.bits
+    if values.dtype == bool:
+        hints.refuse(path, f"{form} of bool", "bits")
+        bits = 1
+    bits = bits or hints.bits
     if bits is None or values.dtype.kind not in "bui":
         raise ValueError(f"{path}: {values.dtype} codes need a number of bits, as in bits=3")
 
@@ -262,6 +267,7 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
     columns = -(-width // 8) if packed else width
     parts = [_shard(shard, channel, channels, columns, width) for shard in shards]
     if packed:
+        hints.refuse(path, "visionsim", "bits")
         bits = 1
     else:
         bits = hints.bits or 1 if planes is None else _bits_of_sums(description, planes, hints.bits)

@@ -113,7 +113,9 @@ def _picks(path: Path, axes: str, sizes: dict[str, int], hints: Hints) -> dict[s
     """Return the chosen index of axes C and Z."""
     found = {}
     for letter, name in PICKED.items():
-        index = getattr(hints, name) if letter in axes else None
+        if letter not in axes:
+            hints.refuse(path, f"axes {axes}", name)
+        index = getattr(hints, name)
         if index is None:
             continue
         if index >= sizes[letter]:

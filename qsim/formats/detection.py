@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,32 +13,50 @@ from qsim.formats import array_files, hdf5, images, mat_files, photon_times, raw
 from qsim.formats.recording import Hints, Recording
 from qsim.lazy_array import LazyArray
 
-Reader = Callable[[Path, Hints], Recording]
 SMOOTH = 1.5  # roughness below which a layout may be right, and how much rougher the next one must then be
-LAYOUTS: dict[str, Reader] = {  # the names of --layout
-    "cube": array_files.read_cube,
-    "codes": array_files.read_codes_npy,
-    "light": array_files.read_light_npy,
-    "video": video.read_video,
-    "png": images.read_png,
-    "tiff": images.read_tiff,
-    "swissspad2-half": raw_cameras.read_swissspad2_half,
-    "swissspad2-full": raw_cameras.read_swissspad2_full,
-    "spad512s": raw_cameras.read_spad512s,
-    "visionsim": array_files.read_visionsim,
-    "zarr": array_files.read_zarr,
-    "mat": mat_files.read_mat,
-    "hdf5": hdf5.read_hdf5,
-    "spike": raw_cameras.read_spike,
-    "photons": photon_times.read_photons,
-    "raw": raw_layout.read_raw,
-    "mono10p": raw_layout.read_mono10p,
-    "mono12p": raw_layout.read_mono12p,
-    "mono10packed": raw_layout.read_mono10packed,
-    "mono12packed": raw_layout.read_mono12packed,
-    "mraw": raw_layout.read_mraw,
-    "ptu": tcspc.read_ptu,
-    "sdt": tcspc.read_sdt,
+
+
+@dataclass(frozen=True)
+class KnownLayout:
+    """How a layout is read, and the hints that its codes and its light take; any other hint is refused."""
+
+    read: Callable[[Path, Hints], Recording]
+    codes: tuple[str, ...] = ()
+    light: tuple[str, ...] = ()
+
+    def takes(self, recording: Recording) -> tuple[str, ...]:
+        return self.light if recording.is_light else self.codes
+
+
+_AXES = ("axes", "channel", "slice")
+_LIGHT = ("transfer", "white", "black")
+_SIZE = ("height", "width")
+_PACKED = (*_SIZE, "skip_bytes", "row_padding")
+_RAW = (*_PACKED, "bits", "order", "endian")
+LAYOUTS: dict[str, KnownLayout] = {  # the names of --layout
+    "cube": KnownLayout(array_files.read_cube, codes=("channel", "width")),
+    "codes": KnownLayout(array_files.read_codes_npy, codes=(*_AXES, "bits")),
+    "light": KnownLayout(array_files.read_light_npy, light=(*_AXES, *_LIGHT)),
+    "video": KnownLayout(video.read_video, light=_LIGHT),
+    "png": KnownLayout(images.read_png, codes=("bits", "stretched"), light=_LIGHT),
+    "tiff": KnownLayout(images.read_tiff, codes=(*_AXES, "bits", "stretched"), light=(*_AXES, *_LIGHT)),
+    "swissspad2-half": KnownLayout(raw_cameras.read_swissspad2_half),
+    "swissspad2-full": KnownLayout(raw_cameras.read_swissspad2_full),
+    "spad512s": KnownLayout(raw_cameras.read_spad512s),
+    "visionsim": KnownLayout(array_files.read_visionsim, codes=("channel", "bits")),
+    "zarr": KnownLayout(array_files.read_zarr, codes=("bits",)),
+    "mat": KnownLayout(mat_files.read_mat, codes=("variable", "bits")),
+    "hdf5": KnownLayout(hdf5.read_hdf5, codes=(*_AXES, "dataset", "bits"), light=(*_AXES, "dataset", *_LIGHT)),
+    "spike": KnownLayout(raw_cameras.read_spike, codes=_SIZE),
+    "photons": KnownLayout(photon_times.read_photons, codes=("bits",)),
+    "raw": KnownLayout(raw_layout.read_raw, codes=_RAW, light=(*_RAW, *_LIGHT)),
+    "mono10p": KnownLayout(raw_layout.read_mono10p, codes=_PACKED, light=(*_PACKED, *_LIGHT)),
+    "mono12p": KnownLayout(raw_layout.read_mono12p, codes=_PACKED, light=(*_PACKED, *_LIGHT)),
+    "mono10packed": KnownLayout(raw_layout.read_mono10packed, codes=_PACKED, light=(*_PACKED, *_LIGHT)),
+    "mono12packed": KnownLayout(raw_layout.read_mono12packed, codes=_PACKED, light=(*_PACKED, *_LIGHT)),
+    "mraw": KnownLayout(raw_layout.read_mraw, light=_LIGHT),
+    "ptu": KnownLayout(tcspc.read_ptu, codes=(*_AXES, "bits")),
+    "sdt": KnownLayout(tcspc.read_sdt, codes=(*_AXES, "bits")),
 }
 _WHOLE = "none: whole bytes per pixel"
 # (bit order, orientation) of layouts whose readers do not state it, and the reason for it.
@@ -206,7 +225,7 @@ def _detect_raw(path: Path, many: bool = False) -> str:
     evidence = []
     found = []
     for name in fitting:
-        sample = LAYOUTS[name](path, Hints()).read(0, min(64, size // raw_cameras.RAW_FRAME) or 1)
+        sample = LAYOUTS[name].read(path, Hints()).read(0, min(64, size // raw_cameras.RAW_FRAME) or 1)
         found.append(raw_cameras.roughness(sample))
         evidence.append(f"{name} (roughness {found[-1]:.2f})")
     least, second = sorted(found)[:2]

@@ -157,9 +157,10 @@ def picture(path: Path, shape: tuple[int, int, int], raw: Any, first: Page, form
     full = 2**first.depth - 1
     few = 1 < first.depth < 8 and not colour
     codes = one_bit or hints.bits is not None or (few and hints.transfer is None and hints.white is None)
-    if codes:  # of one bit, --bits and --stretched have no effect
+    if one_bit:
+        hints.refuse(path, f"{form} of one bit", "stretched", *(() if hints.bits == 1 else ("bits",)))
+    if codes:
         bits = first.depth if one_bit or hints.bits is None else hints.bits
-        stretched = not one_bit and hints.stretched
         top = 2**bits - 1
         if few and hints.bits is None:
             reading = "; ".join(filter(None, (reading, f"read as codes of {bits} bits, the depth of its pixels")))
@@ -168,7 +169,7 @@ def picture(path: Path, shape: tuple[int, int, int], raw: Any, first: Page, form
             values = raw(start, stop)
             if values.ndim == 4:
                 raise ValueError(f"{path}: colour pictures hold no codes")
-            if stretched:
+            if hints.stretched:
                 return _unstretch(path, values, top, start, full)
             return checked_codes(path, values, bits, start)
 

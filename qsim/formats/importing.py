@@ -14,7 +14,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -61,13 +61,11 @@ def read(
         raise ValueError(f"layout {layout!r}: known are {', '.join(LAYOUTS)}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file")
-    asked = {"layout", "flip", "columns", *compared}
-    recording = LAYOUTS[layout](path, cast(Hints, _Watched(hints, asked)))
-    asked |= {"keep_gaps"} if recording.times is not None and not timed else set()
-    for field in fields(Hints):
-        given = getattr(hints, field.name) != field.default
-        if given and field.name not in asked:
-            raise ValueError(f"{path}: {field.name}= changes nothing for {recording.format}; leave it out")
+    recording = LAYOUTS[layout].read(path, hints)
+    acting = {"layout", "flip", "columns", *compared, *LAYOUTS[layout].takes(recording)}
+    if recording.times is not None and not timed:
+        acting.add("keep_gaps")
+    hints.refuse(path, recording.format, *(field.name for field in fields(Hints) if field.name not in acting))
     if layout in ASSUMED:
         recording = with_stated_layout(recording, *ASSUMED[layout])
     turned = reoriented(recording, hints)
@@ -119,18 +117,6 @@ def from_video(  # noqa: PLR0913 (settings of a public function)
     target = temporary.path / name if temporary else Path(path or "")
     clip = to_clip(recording, target, Import(rate, split=split), force=force, progress=progress)
     return replace(clip, keeps=temporary)
-
-
-@dataclass(frozen=True)
-class _Watched:
-    """Hints that record which of them a reader uses."""
-
-    hints: Hints
-    asked: set[str]
-
-    def __getattr__(self, name: str) -> Any:
-        self.asked.add(name)
-        return getattr(self.hints, name)
 
 
 @dataclass(frozen=True)

@@ -124,9 +124,10 @@ def read_raw(path: Path, hints: Hints) -> Recording:
     assert hints.width is not None
     assert hints.bits is not None
     convert(hints.bits, Bits, f"{path}: bits")
-    for name in ("order", "endian"):
-        if hints.bits == 8 and getattr(hints, name) is not None:
-            raise ValueError(f"{path}: {name}= changes nothing for pixels of 8 bits; leave it out")
+    if hints.bits == 8:
+        hints.refuse(path, "pixels of 8 bits", "order", "endian")
+    if hints.bits == 16:
+        hints.refuse(path, "pixels of 16 bits", "order")
     if hints.order is not None and hints.endian is not None:
         raise ValueError(f"{path}: order= states packed pixels, endian= pixels of whole bytes; leave one of them out")
     layout = _with_gaps(Layout(hints.height, hints.width, hints.bits), hints)

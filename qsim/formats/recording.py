@@ -117,6 +117,12 @@ class Hints(Layout):
         setting("reading: pixel value at which the camera saturates; writing pictures: light at full scale"),
     ] = None
 
+    def refuse(self, path: Path, kind: str, *names: str) -> None:
+        """Raise `ValueError` if one of these hints is given: it has no effect on this `kind` of input."""
+        for name in names:
+            if getattr(self, name) != getattr(Hints, name):
+                raise ValueError(f"{path}: {name}= changes nothing for {kind}; leave it out")
+
 
 def check_size(path: Path, size: int, frame_bytes: int, what: str, footer: tuple[int, ...] = (0,)) -> int:
     """Return the number of frames in a raw file of `size` bytes; `ValueError` if it is not a whole number."""

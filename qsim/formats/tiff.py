@@ -50,6 +50,7 @@ def frames_of(path: Path, hints: Hints) -> Stack:
         rows = opened.pages.first.imagelength
         columns = opened.pages.first.imagewidth
     if (hints.axes is None and len(before) < 2 and stated[:1] not in ("C", "S")) or count == 1:
+        hints.refuse(path, "a TIFF without such an axis", *axes.PICKED.values())
         return Stack(tuple(range(count)), "")
     size = (*before, rows, columns)
     found = axes.named(path, size, hints, f"{stated}YX")

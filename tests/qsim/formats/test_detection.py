@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import raw_planes
+import tifffile
+from PIL import Image
 from recordings import clip_of, everything
 
 from qsim.cli.program import main
@@ -59,6 +61,27 @@ def test_given_hints_decide_what_an_array_holds(tmp_path: Path):
     np.save(tmp_path / "planes.npy", np.random.default_rng(1).integers(0, 256, (3, 5, 7)).astype(np.uint8))
     with pytest.raises(ValueError, match="bits= changes nothing for photon cube"):
         everything(tmp_path / "planes.npy", bits=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "hints", "kind"),
+    [
+        ("codes.npy", {"bits": 3, "channel": 0}, "axes TYX"),
+        ("planes.npy", {"bits": 1}, "codes of bool"),
+        ("one.png", {"bits": 3}, "PNG of one bit"),
+        ("one.png", {"stretched": True}, "PNG of one bit"),
+        ("one.tif", {"slice": 0}, "a TIFF without such an axis"),
+    ],
+)
+def test_a_hint_that_cannot_act_is_refused(tmp_path: Path, name: str, hints: dict[str, object], kind: str):
+    codes = np.random.default_rng(0).integers(0, 2, (2, 3, 4)).astype(np.uint8)
+    np.save(tmp_path / "codes.npy", codes)
+    np.save(tmp_path / "planes.npy", codes.astype(bool))
+    Image.fromarray(codes[0].astype(bool)).save(tmp_path / "one.png")
+    tifffile.imwrite(tmp_path / "one.tif", codes[0])
+    refused = next(reversed(hints))
+    with pytest.raises(ValueError, match=f"{refused}= changes nothing for {kind}; leave it out"):
+        importing.read(tmp_path / name, Hints(**hints))
 
 
 def test_pictures_that_look_like_a_cube_are_asked_about(tmp_path: Path):
