@@ -24,6 +24,7 @@ from qsim.colour import luminance, to_linear
 from qsim.file_order import numbered
 from qsim.files import decoding_errors, load_array
 from qsim.formats import axes
+from qsim.formats.export_info import Stated, beside, is_ours
 from qsim.formats.recording import (
     Hints,
     Recording,
@@ -72,8 +73,10 @@ def read_cube(path: Path, hints: Hints) -> Recording:
     if array.dtype != np.uint8 or array.ndim != 3:
         raise ValueError(f"{path}: a photon cube is uint8 [T, H, bytes], found {array.dtype} {list(array.shape)}")
     frames, height, columns = check_shape(path, array.shape)
-    known = written_with(path, description) or {}
-    width = hints.width if hints.width is not None else known.get("shape", (0, 0, 8 * columns))[2]
+    known = written_with(path, description)
+    width = hints.width
+    if width is None:
+        width = 8 * columns if known is None else known["shape"][2]
     if not 8 * (columns - 1) < width <= 8 * columns:
         raise ValueError(
             f"{path}: {columns} bytes per row hold {8 * columns - 7} to {8 * columns} pixels, not width={width}"
@@ -82,27 +85,15 @@ def read_cube(path: Path, hints: Hints) -> Recording:
     def read(start: int, stop: int) -> Array:
         return np.unpackbits(np.asarray(array[start:stop]), axis=-1, count=width)
 
-    stated = known.get("orientation")
-    orientation = stated if isinstance(stated, str) else ""
+    orientation = "" if known is None else known.get("orientation", "")
     source = Source(format="photon cube", bit_order="msb", orientation=orientation)
     return Recording((frames, height, width), read, source, 1)
 
 
-def written_with(path: Path, description: str) -> dict[str, Any] | None:
+def written_with(path: Path, description: str) -> Stated | None:
     """Return a description, NAME.npy.json, if `qsim convert` wrote it beside a photon cube; else None."""
-    try:
-        found = files.read_json(path.with_name(description))
-    except (OSError, ValueError):
-        return None
-    software = found.get("software")
-    shape = found.get("shape")
-    ours = isinstance(software, dict) and "qsim" in software and _is_shape(shape)
-    return found if ours else None
-
-
-def _is_shape(found: Any) -> bool:
-    """Return whether a value of a file is the shape [T, H, W] of frames."""
-    return isinstance(found, list) and len(found) == 3 and all(type(n) is int and n >= 1 for n in found)
+    stated = beside(path.with_name(description))
+    return stated if is_ours(stated) and "shape" in stated else None
 
 
 @dataclass(frozen=True)

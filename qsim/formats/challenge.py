@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -24,6 +23,7 @@ from qsim import files, opening
 from qsim.checks import check_shape
 from qsim.colour import from_linear
 from qsim.files import decoding_errors, load_array
+from qsim.formats.export_info import CubesInfo
 from qsim.lazy_array import LazyArray
 from qsim.sensor import packing
 from qsim.sensor.colour_filter import MASKS
@@ -38,7 +38,7 @@ DETECTIONS = 0.5  # expected per plane at white
 _TOGETHER = 64  # planes written at a time
 
 
-def write(clip: Clip, folder: Path, planes: int) -> dict[str, Any]:
+def write(clip: Clip, folder: Path, planes: int) -> CubesInfo:
     """Write the cubes of a clip and their truth to a folder; return what meta.json states of them.
 
     Cubes do not overlap, and planes that fill no cube are left out. `ValueError` without three streams of one bit.
@@ -52,17 +52,17 @@ def write(clip: Clip, folder: Path, planes: int) -> dict[str, Any]:
         clipped += float((light > 1).mean())
         _write_picture(folder / f"{n:06d}.png", light)
     cubes = frames // planes
-    return {
-        "cubes": cubes,
-        "planes": planes,
-        "width": width,
-        "left_out": frames - cubes * planes,
-        "detections_at_white": DETECTIONS,
-        "clipped": clipped / cubes,
-        "seeds": [band.info.seed for band in bands],
-        "sensors": [band.info.sensor for band in bands],
-        "benchmark": (planes, height, width) == (PLANES, SIDE, SIDE),
-    }
+    return CubesInfo(
+        cubes=cubes,
+        planes=planes,
+        width=width,
+        left_out=frames - cubes * planes,
+        detections_at_white=DETECTIONS,
+        clipped=clipped / cubes,
+        seeds=tuple(band.info.seed for band in bands),
+        sensors=tuple(band.info.sensor for band in bands),
+        benchmark=(planes, height, width) == (PLANES, SIDE, SIDE),
+    )
 
 
 def bands_of(clip: Clip, planes: int) -> list[Stream]:
@@ -100,16 +100,16 @@ def bands_of(clip: Clip, planes: int) -> list[Stream]:
     return bands
 
 
-def line(meta: dict[str, Any]) -> str:
-    """Return one line on the cubes that meta.json describes."""
-    _, height, width = meta["shape"]
-    size = "as the benchmark's" if meta["benchmark"] else f"the benchmark's are {PLANES} of {SIDE} x {SIDE}"
-    number = "1 cube" if meta["cubes"] == 1 else f"{meta['cubes']} cubes"
+def line(made: CubesInfo, shape: tuple[int, int, int]) -> str:
+    """Return one line on the cubes of a clip of this shape."""
+    _, height, width = shape
+    size = "as the benchmark's" if made.benchmark else f"the benchmark's are {PLANES} of {SIDE} x {SIDE}"
+    number = "1 cube" if made.cubes == 1 else f"{made.cubes} cubes"
     return (
-        f"{number} of {meta['planes']} planes of {height} x {width} pixels in three colours ({size}) "
+        f"{number} of {made.planes} planes of {height} x {width} pixels in three colours ({size}) "
         f"with the truth of their last planes, white = {DETECTIONS:g} detections, "
-        f"{100 * meta['clipped']:.3g} % of it above white; not written: flow, depth, planes that fill no "
-        f"cube ({meta['left_out']})"
+        f"{100 * made.clipped:.3g} % of it above white; not written: flow, depth, planes that fill no "
+        f"cube ({made.left_out})"
     )
 
 

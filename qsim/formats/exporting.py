@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files, records, scratch
+from qsim import files, scratch
 from qsim.clip.manifest import check_outside
 from qsim.colour import code_levels, peak
-from qsim.files import VERSION
 from qsim.formats import array_files, challenge, event_files, images, photon_times, raw_cameras, video
+from qsim.formats.export_info import ExportInfo, beside, is_ours
 from qsim.scene.camera_path import camera_path
 from qsim.streams.clip import Clip
 from qsim.streams.event_stream import EventStream
@@ -41,6 +41,11 @@ def export(source: Source, path: Path, wanted: Export, *, force: bool = False) -
 
     `ValueError` if the kind cannot hold it: a photon cube holds one bit, an EXR holds light.
     """
+    _export(source, path, wanted, force)
+    return path
+
+
+def _export(source: Source, path: Path, wanted: Export, force: bool) -> ExportInfo:
     if wanted.kind not in EXPORTS:
         raise ValueError(f"{path}: unknown kind {wanted.kind!r}; there are {', '.join(EXPORTS)}")
     check(source, wanted)
@@ -49,7 +54,7 @@ def export(source: Source, path: Path, wanted: Export, *, force: bool = False) -
     check_outside(path)
     if (path.exists() or path.is_symlink()) and not force:
         raise FileExistsError(f"{path}: exists; name another, or replace it with force=True")
-    meta = _export_meta(source, wanted)
+    info = _info(source, wanted)
     path.parent.mkdir(parents=True, exist_ok=True)
     single = wanted.kind in ("cube", "mp4", "spike", "photons", "events")
     side = path.with_name(path.name + ".json")
@@ -58,14 +63,14 @@ def export(source: Source, path: Path, wanted: Export, *, force: bool = False) -
         _check_ours(place, side if single else place / "meta.json", single)
     if single:
         with files.replacing_together(path, side) as (made, described):
-            EXPORTS[wanted.kind](source, made, wanted, meta)
-            files.write_json(described, meta)
-        return path
+            info = EXPORTS[wanted.kind](source, made, wanted, info)
+            files.write_json(described, info.values)
+        return info
     with files.naming(path), scratch.Scratch(path) as unfinished:
         part = unfinished.new()
         part.mkdir()
-        EXPORTS[wanted.kind](source, part, wanted, meta)
-        files.write_json(part / "meta.json", meta)
+        info = EXPORTS[wanted.kind](source, part, wanted, info)
+        files.write_json(part / "meta.json", info.values)
         if path.exists():  # or it appeared meanwhile
             if not force:
                 raise FileExistsError(
@@ -75,7 +80,7 @@ def export(source: Source, path: Path, wanted: Export, *, force: bool = False) -
             files.remove_folder(path)
         part.rename(path)
     files.sync_folder(path.parent)
-    return path
+    return info
 
 
 def check(source: Source, wanted: Export) -> None:
@@ -96,25 +101,24 @@ def check(source: Source, wanted: Export) -> None:
 
 def described(source: Source, path: Path, wanted: Export, *, force: bool = False) -> tuple[Path, str]:
     """Export; return the path and one line: kind, frames, size, rates, white."""
-    made = export(source, path, wanted, force=force)
+    info = _export(source, path, wanted, force)
     if isinstance(source, EventStream):
-        return made, source.said
-    side = made / "meta.json" if made.is_dir() else made.with_name(made.name + ".json")
-    meta, (frames, height, width) = files.read_json(side), source.shape
+        return path, source.said
+    if info.cubes is not None:
+        return path, f"challenge, {challenge.line(info.cubes, source.shape)}"
+    frames, height, width = source.shape
     shown = f", played at {wanted.playback:g}" if wanted.kind == "mp4" else ""
     if isinstance(source, Stream):
-        about = f"{source.bits}-bit codes" + (", stretched to 0..255" if meta.get("stretched") else "")
-    elif "white" in meta:
+        about = f"{source.bits}-bit codes" + (", stretched to 0..255" if info.stretched else "")
+    elif info.white is not None:
         bits = _depth(source, wanted)
-        about = f"light in {bits} bits by {meta['transfer']}, white {meta['white']:.4g} {source.info.radiance_unit}"
+        about = f"light in {bits} bits by {info.transfer}, white {info.white:.4g} {source.info.radiance_unit}"
     else:
         about = f"linear light in {source.info.radiance_unit}"
     if isinstance(source, Clip):
         about += "; not written: codes, flow, depth (to=pairs writes codes, truth and flow)"
     rate = source.info.frame_rate
-    if wanted.kind == "challenge":
-        return made, f"challenge, {challenge.line(meta)}"
-    return made, f"{wanted.kind}, {frames} frames of {height} x {width} pixels at {rate:g} per second{shown}, {about}"
+    return path, f"{wanted.kind}, {frames} frames of {height} x {width} pixels at {rate:g} per second{shown}, {about}"
 
 
 _NAMES = (
@@ -127,49 +131,46 @@ def _check_ours(place: Path, description: Path, single: bool) -> None:
     """Raise `FileExistsError` if `place` exists and is not an export with its description."""
     if not place.exists() and not place.is_symlink():
         return
-    foreign = FileExistsError(f"{place}: was not written by `qsim convert`; move it, or name another output")
-    if place.is_symlink() or place.is_dir() == single or not description.is_file():
-        raise foreign
-    try:
-        software = files.read_json(description).get("software")
-    except ValueError:
-        raise foreign from None
-    if not isinstance(software, dict) or "qsim" not in software:
-        raise foreign
+    if place.is_symlink() or place.is_dir() == single or not is_ours(beside(description)):
+        raise FileExistsError(f"{place}: was not written by `qsim convert`; move it, or name another output")
     if not single:
         files.check_ours(place, _NAMES)
 
 
-def _cube(source: Clip | Stream, path: Path, _wanted: Export, _meta: dict[str, Any]) -> None:
+def _cube(source: Clip | Stream, path: Path, _wanted: Export, info: ExportInfo) -> ExportInfo:
     if isinstance(source, Clip) or source.bits != 1:
         what = "a clip holds light" if isinstance(source, Clip) else f"this stream has {source.bits}"
         summed = isinstance(source, Stream) and source.sums is not None and source.sums.planes > 1
         cure = "sums of planes have none: export the single planes" if summed else "sense it with bits=1"
         raise ValueError(f"{source.path}: a photon cube holds one bit per pixel, {what}; {cure}")
     array_files.write_cube(path, _code_blocks(source), source.shape)
+    return info
 
 
-def _mp4(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+def _mp4(source: Clip | Stream, path: Path, wanted: Export, info: ExportInfo) -> ExportInfo:
     if isinstance(source, Stream) and source.bits > 8:
         raise ValueError(
             f"{source.path}: a video holds 8 bits per pixel, this stream has {source.bits}; use png or zarr"
         )
     if isinstance(source, Clip) and wanted.lossless:
         source.require_one_band("lossless mp4")
-    video.write_video(path, _grey(source, wanted, meta), wanted.playback, lossless=wanted.lossless)
+    video.write_video(path, _grey(source, wanted, info), wanted.playback, lossless=wanted.lossless)
+    return info
 
 
-def _png(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+def _png(source: Clip | Stream, path: Path, wanted: Export, info: ExportInfo) -> ExportInfo:
     if isinstance(source, Clip):
-        images.write_png(path, _grey(source, wanted, meta))
+        images.write_png(path, _grey(source, wanted, info))
     else:
         codes = (image for block in _code_blocks(source) for image in block)
         images.write_png(path, (image.astype(bool) if source.bits == 1 else image for image in codes))
+    return info
 
 
-def _nerfstudio(source: Any, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
-    images.write_png(path, _grey(source, wanted, meta))
+def _nerfstudio(source: Any, path: Path, wanted: Export, info: ExportInfo) -> ExportInfo:
+    images.write_png(path, _grey(source, wanted, info))
     files.write_json(path / "transforms.json", camera_file(source))
+    return info
 
 
 def camera_file(clip: Clip) -> dict[str, Any]:
@@ -187,46 +188,49 @@ def camera_file(clip: Clip) -> dict[str, Any]:
     return camera_path(clip.camera, poses, names, clip.frame_rate, clip.origin) | {"w": width, "h": height}
 
 
-def _exr(source: Clip | Stream, path: Path, _wanted: Export, _meta: dict[str, Any]) -> None:
+def _exr(source: Clip | Stream, path: Path, _wanted: Export, info: ExportInfo) -> ExportInfo:
     if not isinstance(source, Clip):
         raise ValueError(f"{source.path}: EXR holds light, this is a stream of codes; use png, zarr or mp4")
     images.write_exr(path, (source.radiance(t) for t in range(len(source))))
+    return info
 
 
-def _zarr(source: Clip | Stream, path: Path, _wanted: Export, meta: dict[str, Any]) -> None:
+def _zarr(source: Clip | Stream, path: Path, _wanted: Export, info: ExportInfo) -> ExportInfo:
     if isinstance(source, Clip):
         source.require_one_band("zarr")
     frames, height, width = source.shape
-    rate = float(meta["frame_rate"])
+    rate = source.info.frame_rate
     # quanta-spad-sim calls the length of the whole recording T_exp.
     attributes = {"fps": rate, "T_exp": frames / rate, "T": frames, "H": height, "W": width, "shape": [*source.shape]}
     blocks = _light_blocks(source) if isinstance(source, Clip) else _code_blocks(source)
-    array_files.write_zarr(path, blocks, source.shape, attributes | {"qsim": meta})
+    array_files.write_zarr(path, blocks, source.shape, attributes | {"qsim": info.values})
+    return info
 
 
-def _challenge(source: Any, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
-    meta |= challenge.write(source, path, wanted.planes)
+def _challenge(source: Any, path: Path, wanted: Export, info: ExportInfo) -> ExportInfo:
+    return info.but(cubes=challenge.write(source, path, wanted.planes))
 
 
-def _spike(source: Clip | Stream, path: Path, _wanted: Export, meta: dict[str, Any]) -> None:
+def _spike(source: Clip | Stream, path: Path, _wanted: Export, info: ExportInfo) -> ExportInfo:
     if isinstance(source, Clip) or source.bits != 1:
         what = "this is light" if isinstance(source, Clip) else f"this stream has {source.bits}"
         raise ValueError(f"{source.path}: a spike file holds one bit per pixel, {what}; name a stream of one bit")
     raw_cameras.write_spike(path, _code_blocks(source), source.shape)
-    meta |= {"bit_order": "lsb", "orientation": "upside down"}
+    return info.but(bit_order="lsb", orientation="upside down")
 
 
-def _events(source: Any, path: Path, _wanted: Export, _meta: dict[str, Any]) -> None:
+def _events(source: Any, path: Path, _wanted: Export, info: ExportInfo) -> ExportInfo:
     event_files.write(source, path)
+    return info
 
 
-def _photons(source: Clip | Stream, path: Path, _wanted: Export, meta: dict[str, Any]) -> None:
+def _photons(source: Clip | Stream, path: Path, _wanted: Export, info: ExportInfo) -> ExportInfo:
     if isinstance(source, Clip):
         raise ValueError(f"{source.path}: a clip has light, and no single photons; name one of its streams")
-    meta |= {"events": photon_times.write(source, path)}
+    return info.but(events=photon_times.write(source, path))
 
 
-EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
+EXPORTS: dict[str, Callable[[Any, Path, Export, ExportInfo], ExportInfo]] = {
     "cube": _cube,
     "mp4": _mp4,
     "png": _png,
@@ -240,32 +244,26 @@ EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
 }
 
 
-def _export_meta(source: Source, wanted: Export) -> dict[str, Any]:
-    if isinstance(source, Clip):
-        facts = {key: value for key, value in records.plain(source.info, complete=True).items() if value is not None}
-        kept = ("shape", "frame_rate", "exposure", "radiance_unit", "scene", "split", "seed", "bands", "origin")
-        found = {key: facts[key] for key in kept if key in facts}
-    else:
-        own = ("sha256", "software", "clip_key")  # of the stream's file
-        found = {key: value for key, value in records.plain(source.info).items() if key not in own}
-    found |= {"format_version": 1, "software": {"qsim": VERSION}, "orientation": source.info.orientation}
+def _info(source: Source, wanted: Export) -> ExportInfo:
+    """Return the description of an export before it is written: what is known of it by its source and its kind."""
+    info = ExportInfo(source=source.info, orientation=source.info.orientation)
     if isinstance(source, EventStream):
-        return found | {"time_unit": "us", "time_zero": "middle of the exposure of frame 0"}
-    found["bit_order"] = "msb"
-    if isinstance(source, Clip):
-        written = {"exr": "linear", "zarr": "linear", "challenge": "srgb"}
-        found["transfer"] = written.get(wanted.kind, wanted.transfer)
-        if wanted.kind in ("mp4", "png", "nerfstudio"):
-            found["white"] = wanted.white if wanted.white is not None else _white(source)
-    elif wanted.kind == "mp4":
-        found["stretched"] = True
-    return found | ({"lossless": wanted.lossless} if wanted.kind == "mp4" else {})
+        return info.but(time_unit="us", time_zero="middle of the exposure of frame 0")
+    info = info.but(bit_order="msb", lossless=wanted.lossless if wanted.kind == "mp4" else None)
+    if isinstance(source, Stream):
+        return info.but(stretched=True) if wanted.kind == "mp4" else info
+    stated = {"exr": "linear", "zarr": "linear", "challenge": "srgb"}
+    info = info.but(transfer=stated.get(wanted.kind, wanted.transfer))
+    if wanted.kind not in ("mp4", "png", "nerfstudio"):
+        return info
+    return info.but(white=wanted.white if wanted.white is not None else _white(source))
 
 
-def _grey(source: Clip | Stream, wanted: Export, meta: dict[str, Any]) -> Iterator[Array]:
+def _grey(source: Clip | Stream, wanted: Export, info: ExportInfo) -> Iterator[Array]:
     if isinstance(source, Clip):
+        assert info.white is not None
         for block in _light_blocks(source):
-            levels = images.grey(block, meta["white"], wanted.transfer, _depth(source, wanted))
+            levels = images.grey(block, info.white, wanted.transfer, _depth(source, wanted))
             yield from levels if source.bands is None else np.ascontiguousarray(np.moveaxis(levels, -3, -1))
     else:
         for block in _code_blocks(source):

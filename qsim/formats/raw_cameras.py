@@ -17,6 +17,7 @@ from numpy import ndarray as Array
 from qsim import files, opening
 from qsim.checks import check_shape
 from qsim.clip.source import Source
+from qsim.formats.export_info import beside
 from qsim.formats.raw_layout import raw_files
 from qsim.formats.recording import Hints, Recording, check_size
 
@@ -79,11 +80,9 @@ def read_spike(path: Path, hints: Hints) -> Recording:
     height = hints.height
     width = hints.width
     config = path.parent / "config.yaml"
-    ours = path.with_name(f"{path.name}.json")
-    if height is None and width is None and ours.is_file():  # written by `write_spike`
-        shape = files.read_json(ours).get("shape")
-        if isinstance(shape, list) and len(shape) == 3 and all(type(n) is int for n in shape):
-            _, height, width = shape
+    stated = beside(path.with_name(f"{path.name}.json")).get("shape")  # of an export
+    if height is None and width is None and stated is not None:
+        _, height, width = stated
     if height is None and width is None and config.is_file():
         settings = opening.content(config, "description").decode("utf-8", "replace")
         found = dict(re.findall(r"^\s*(spike_h|spike_w)\s*:\s*(\d{1,9})\b", settings, re.M))

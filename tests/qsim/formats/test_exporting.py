@@ -215,10 +215,11 @@ def test_an_export_does_not_replace_what_appeared_meanwhile(tmp_path: Path, monk
     target = tmp_path / "out"
     real = exporting.EXPORTS["png"]
 
-    def slow(*words: object) -> None:
-        real(*words)
+    def slow(*words: object) -> object:
+        info = real(*words)
         target.mkdir()
         (target / "notes.txt").write_text("mine")
+        return info
 
     monkeypatch.setitem(exporting.EXPORTS, "png", slow)
     for force, told in ((False, "out: appeared while it was written; move it away"), (True, "out: was not written by")):
