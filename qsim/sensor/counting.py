@@ -15,13 +15,13 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.keys import Key, normal, uniform_pair, words
-from qsim.sensor import counting_moments, paralyzable_steps
+from qsim.sensor import counting_moments, paralyzable
+from qsim.sensor.code_search import decide, search
 from qsim.sensor.compiled.curves import Curves, below, by_pairs, falling
 from qsim.sensor.compiled.plan import MOST_BITS, Live, Plan
 from qsim.sensor.distribution import LONGEST, SHORTEST, check_exposure, require_number, require_size
 from qsim.sensor.paralyzable import Paralyzable, most_counts
 from qsim.sensor.poisson import poisson_log_pmf
-from qsim.sensor.qis_steps import decide, search
 from qsim.sensor.spad import SPAD
 
 _ROWS = 1 << 14  # pixels of a block whose steps are computed one by one
@@ -95,8 +95,8 @@ class CountingSPAD(SPAD):
         """Return F_k = P(N < k + 1) = Q(k + 1, live_k): the regularised incomplete gamma function."""
         from scipy.special import gammaincc
 
-        if (paralyzable := self.dead_time_law(exposure)) is not None:
-            return paralyzable.cdf(arrivals)
+        if (law := self.dead_time_law(exposure)) is not None:
+            return law.cdf(arrivals)
         cdf = gammaincc(np.arange(1.0, self.levels + 1), self._live(arrivals, exposure))
         cdf[:, -1] = 1.0
         return cdf
@@ -108,8 +108,8 @@ class CountingSPAD(SPAD):
         """
         from scipy.special import gammainc, gammaincc
 
-        if (paralyzable := self.dead_time_law(exposure)) is not None:
-            return paralyzable.log_pmf(arrivals, wanted)
+        if (law := self.dead_time_law(exposure)) is not None:
+            return law.log_pmf(arrivals, wanted)
         live = self._live(arrivals, exposure)
         before = np.column_stack([arrivals, live[:, :-1]])
         k = np.arange(self.levels)
@@ -225,7 +225,7 @@ class CountingSPAD(SPAD):
         self, ratio: float, below: Array, above: Array, photons: Array, exposure: float
     ) -> tuple[Array, Array]:
         top = min(self.levels - 1, most_counts(ratio))
-        return paralyzable_steps.decide(ratio, top, below, above, self.arrivals(photons, exposure).ravel())
+        return paralyzable.decide(ratio, top, below, above, self.arrivals(photons, exposure).ravel())
 
     def _guess(self, arrivals: Array, exposure: float, z: Array) -> Array:
         """Return about the code at z standard deviations of a renewal count, whose gaps are a dead time and a wait."""
@@ -258,8 +258,8 @@ class CountingSPAD(SPAD):
 
     def slope_of(self, arrivals: Array, exposure: float) -> Array:
         """Return dF_k/darrivals = -share_k Pois(k; live_k), share_k being the live share after k counts."""
-        if (paralyzable := self.dead_time_law(exposure)) is not None:
-            return paralyzable.slope(arrivals)
+        if (law := self.dead_time_law(exposure)) is not None:
+            return law.slope(arrivals)
         k = np.arange(self.levels)
         share = np.maximum(1 - k * (self.dead_time / exposure), 0)
         slope = -share * np.exp(poisson_log_pmf(arrivals[:, None] * share, k))
@@ -271,8 +271,8 @@ def _paralyzable_curves(law: Paralyzable, count: int) -> Curves | None:
     """Return curves of the steps F_0 ... F_(count - 1) of a paralyzable pixel; None if no grid is fine enough."""
     if law.by_steps:
         return below(
-            lambda mean: paralyzable_steps.steps(law.ratio, count, mean[0])[0],
-            lambda mean: paralyzable_steps.steps(law.ratio, count, mean[0])[1],
+            lambda mean: paralyzable.steps(law.ratio, count, mean[0])[0],
+            lambda mean: paralyzable.steps(law.ratio, count, mean[0])[1],
             count,
             _BRIGHT,
         )

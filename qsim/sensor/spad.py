@@ -13,9 +13,9 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.keys import Key, normal, require_counters, uniform_pair, words
+from qsim.sensor.code_search import search
 from qsim.sensor.compiled.plan import MOST_BITS, Live, Plan
 from qsim.sensor.distribution import MOST_EVENTS, require_bits, require_number, require_size
-from qsim.sensor.qis_steps import search
 from qsim.sensor.sensor import Sensor
 
 _PLANES_BITS = 8  # of a sum drawn plane by plane; above it, the sum is drawn from one number

@@ -7,7 +7,7 @@ from oracles import paralyzable_oracle
 from scipy import stats
 
 from qsim.keys import Key, uniform, words
-from qsim.sensor import paralyzable_steps
+from qsim.sensor import paralyzable
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.sensor import Sensor
 
@@ -16,7 +16,7 @@ EXPOSURE = 5e-4  # s
 
 def steps_of(mean: float, codes: np.ndarray, ratio: float, inside: bool) -> np.ndarray:
     pixels = np.arange(len(codes))
-    nodes = paralyzable_steps.circle(np.full(len(codes), mean), np.full(len(codes), inside), ratio)
+    nodes = paralyzable.circle(np.full(len(codes), mean), np.full(len(codes), inside), ratio)
     return nodes.sums(codes, pixels) + (0 if inside else 1)
 
 
@@ -29,7 +29,7 @@ def random_sensor(rng: np.random.Generator, bits: int, longest: float = 1e6) -> 
 def test_steps_and_their_slopes_are_the_tables(seed):
     """Random dead times from the shortest exposures that have circles; F_k from the side on which it is used."""
     rng = np.random.default_rng([5, seed])
-    ratio = paralyzable_steps.LEAST if seed == 0 else paralyzable_steps.LEAST * 10 ** rng.uniform(0, 1.5)
+    ratio = paralyzable.LEAST if seed == 0 else paralyzable.LEAST * 10 ** rng.uniform(0, 1.5)
     means = np.concatenate([[0.0, 1e-300, 1e-9], 10 ** rng.uniform(-1, 2.6, 4), rng.uniform(0, 200, 3)])
     law = CountingSPAD(1.0, 0.0, EXPOSURE / ratio, 7, True)
     table, slope = (f(means, EXPOSURE)[:, :-1] for f in (law.cdf, law.dcdf))
@@ -39,7 +39,7 @@ def test_steps_and_their_slopes_are_the_tables(seed):
             codes = np.flatnonzero((expected < 0.5) == inside)
             found = steps_of(mean, codes, ratio, inside)
             np.testing.assert_allclose(found, expected[codes], rtol=0, atol=1e-11, err_msg=f"{ratio!r} {mean!r}")
-    grid, change = paralyzable_steps.steps(ratio, width, means)
+    grid, change = paralyzable.steps(ratio, width, means)
     np.testing.assert_allclose(grid.T, table[:, :width], rtol=0, atol=1e-11, err_msg=repr(ratio))
     # Below a millionth of an arrival the slope divides a rounding by the light; curves take it times its root
     np.testing.assert_allclose(change.T[3:], slope[3:, :width], rtol=0, atol=1e-10, err_msg=repr(ratio))

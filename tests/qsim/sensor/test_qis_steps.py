@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from qsim.keys import Key
-from qsim.sensor import qis_steps as steps_module
-from qsim.sensor.qis import QIS, table_length, thresholds
+from qsim.sensor.code_search import decide
+from qsim.sensor.qis import QIS, Thresholds, table_length, thresholds
 from qsim.sensor.sensor import Sensor
 
 EXPOSURE = 5e-4  # s
@@ -61,7 +61,7 @@ def test_codes_found_step_by_step_are_those_of_the_whole_table(seed):
     steps = thresholds(sensor)
     mean = sensor.arrivals(photons, EXPOSURE)
     for guess in (expected, np.zeros(u.size), np.full(u.size, sensor.levels)):  # the guess only saves time
-        found, near = steps_module.decide(steps.cdf, sensor.levels - 1, u, mean, guess)
+        found, near = decide(steps.cdf, sensor.levels - 1, u, mean, guess)
         np.testing.assert_array_equal(found, expected, err_msg=repr(sensor))
         np.testing.assert_array_equal(near <= 2.0**-32, tails)
     np.testing.assert_array_equal(sensor.decide(u, photons, EXPOSURE)[0], expected)
@@ -73,13 +73,13 @@ def test_a_long_table_costs_a_few_steps_a_pixel(bits, gain, noise, monkeypatch):
     sensor = QIS(0.8, 1.6, noise, bits, gain=gain)
     photons = np.random.default_rng(0).uniform(0, 1.2 * sensor.white(EXPOSURE), (64, 64))
     looked = []
-    whole = steps_module.Thresholds.cdf
+    whole = Thresholds.cdf
 
     def counted(self, codes, mean):
         looked.append(len(codes) * (1 + self.weights.shape[1]))
         return whole(self, codes, mean)
 
-    monkeypatch.setattr(steps_module.Thresholds, "cdf", counted)
+    monkeypatch.setattr(Thresholds, "cdf", counted)
     codes = sensor.sample(photons, EXPOSURE, key=Key(1, 2), engine="reference")
     assert 0.3 * sensor.levels < codes.max() <= sensor.levels - 1
     assert sum(looked) / photons.size <= 5 * (2 + 17 * noise)
