@@ -18,7 +18,7 @@ from qsim.lazy_array import Crop
 from qsim.plane_sums import PlaneSums, Read, Sums
 from qsim.sensor import packing
 from qsim.streams.stream import Stream, write_packed
-from qsim.streams.stream_info import StreamInfo, StreamLight
+from qsim.streams.stream_info import StreamInfo
 
 _TOGETHER = 1 << 22  # codes that are packed at a time
 
@@ -87,11 +87,7 @@ def _described(stream: Stream, taken: Sums) -> StreamInfo:
     planes = info.planes_per_code * taken.planes
     rate = info.frame_rate / taken.step
     plane_rate = info.plane_rate or info.frame_rate * info.planes_per_code
-    light = info.light
-    if light is not None:
-        light = StreamLight(
-            factor=light.factor, ppp=light.ppp * taken.planes, before=light.before * taken.planes, lux=light.lux
-        )
+    light = None if info.light is None else info.light.over(taken.planes)
     chosen = taken.codes != len(stream) or taken.planes > 1
     return StreamInfo.of(
         sensor,

@@ -19,7 +19,7 @@ from numpy import ndarray as Array
 
 from qsim.arrays import plain
 from qsim.host import own_numbers
-from qsim.kinds import LARGEST, SMALLEST
+from qsim.kinds import LARGEST, SMALLEST, NotNegative, Positive
 from qsim.lazy_array import Crop
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
@@ -207,9 +207,16 @@ def ppp_factor(mean_photons: float, target: float, name: str = "clip") -> float:
 
 @dataclass(frozen=True)
 class LightLevel:
-    """The light level of a clip: photons at the sensor = factor * photons of the stored radiance, in every pixel."""
+    """The light level of a clip: photons at the sensor = factor * photons of the stored radiance, in every pixel.
 
-    factor: float  # 1 without a target
-    ppp: float  # mean photons per pixel and exposure over the clip, after the factor
-    mean_before: float  # the same before the factor; mean radiance if the clip's unit is relative
-    lux: float | None  # faceplate lux at 555 nm that give `ppp`; None without a camera
+    Of a clip frame, or of a code that collects several; descriptions of streams hold it.
+    """
+
+    factor: Positive  # 1 without a target
+    ppp: NotNegative  # mean photons per pixel and exposure over the clip, after the factor
+    before: NotNegative  # the same before the factor; mean radiance if the clip's unit is relative
+    lux: NotNegative | None = None  # faceplate lux at 555 nm that give `ppp`; None without a camera
+
+    def over(self, frames: int) -> LightLevel:
+        """Return the light level of codes that collect the light of so many frames."""
+        return replace(self, ppp=self.ppp * frames, before=self.before * frames)

@@ -33,7 +33,6 @@ from qsim.streams.event_stream import EVENT, FOLDER, EventInfo, EventStream, wri
 from qsim.streams.photons import clip_photons, light_level, light_line
 from qsim.streams.sensing import AskedLux, AskedPitch, AskedSeed, light_name
 from qsim.streams.stream import tidy, writing
-from qsim.streams.stream_info import StreamLight
 
 _WIDEST = 1 << 16  # columns and rows that an event can name
 
@@ -142,7 +141,6 @@ def prepare(clip: ClipFolder, sensing: EventSensing) -> EventDraw:
 
 def describe(clip: ClipFolder, sensing: EventSensing, draw: EventDraw) -> EventInfo:
     """Return the description of the events of a draw, without what their writer counts."""
-    level = draw.level
     return EventInfo(
         shape=clip.shape,
         frame_rate=clip.frame_rate,
@@ -152,7 +150,7 @@ def describe(clip: ClipFolder, sensing: EventSensing, draw: EventDraw) -> EventI
         clip=clip.name,
         clip_key=draw.key.clip,
         origin=clip.origin,
-        light=StreamLight(factor=level.factor, ppp=level.ppp, before=level.mean_before, lux=level.lux),
+        light=draw.level,
         orientation=clip.info.orientation,
     )
 

@@ -23,9 +23,9 @@ from qsim.checks import file_path
 from qsim.files import VERSION, Progress
 from qsim.host import own_numbers
 from qsim.kinds import Count, Digest, Positive, Text, Whole
+from qsim.optics.radiometry import LightLevel
 from qsim.sensor.event_camera import EventCamera, from_dict
 from qsim.stored_array import StoredArray
-from qsim.streams.stream_info import StreamLight
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 SIZE = 8  # bytes of an event in statements of data rates: what cameras send is 2 to 8
@@ -48,7 +48,7 @@ class EventInfo:
     clip: str  # its name
     clip_key: Count  # of the random numbers, beside the seed
     origin: tuple[Count, Count] = (0, 0)  # y, x of the first pixel in the full frame
-    light: StreamLight  # per clip frame
+    light: LightLevel  # per clip frame
     orientation: Text = "upright"
     events: Count = 0
     brighter: Count = 0  # of these events

@@ -26,13 +26,12 @@ from qsim.streams.preparation import followed, prepare
 from qsim.streams.sensing import Sensing
 from qsim.streams.simulation import Draw
 from qsim.streams.stream import Stream, tidy, write_packed, writing
-from qsim.streams.stream_info import StreamInfo, StreamLight, stored_settings
+from qsim.streams.stream_info import StreamInfo, stored_settings
 
 
 def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> StreamInfo:
     """Return the description of the stream of a draw, without what its writer adds."""
     _, height, width = clip.shape
-    level = draw.level
     return StreamInfo.of(
         draw.sensor,
         sensor_name="" if isinstance(sensing.sensor, Sensor) else sensing.sensor,
@@ -47,9 +46,7 @@ def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> StreamInfo:
         settings=stored_settings(sensing),
         clip=clip.name,
         clip_key=draw.key.clip,
-        light=StreamLight(
-            factor=level.factor, ppp=level.ppp * draw.planes, before=level.mean_before * draw.planes, lux=level.lux
-        ),
+        light=draw.level.over(draw.planes),
         drawn_by=draw.law,
         orientation=clip.info.orientation,
     )

@@ -16,7 +16,8 @@ from qsim import records
 from qsim.clip.source import Source
 from qsim.files import VERSION
 from qsim.frame_times import Times
-from qsim.kinds import Bits, Count, Digest, NotNegative, Number, Positive, Text, Whole
+from qsim.kinds import Bits, Count, Digest, Number, Positive, Text, Whole
+from qsim.optics.radiometry import LightLevel
 from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.defects.event_simulation import Effects
 from qsim.sensor.sensor import Sensor
@@ -24,16 +25,6 @@ from qsim.settings import given
 from qsim.streams.sensing import Sensing
 
 _ELSEWHERE = ("sensor", "bits", "planes", "name", "defects", "colour")  # settings whose outcome the description holds
-
-
-@dataclass(frozen=True, kw_only=True)
-class StreamLight:
-    """The light of a stream."""
-
-    factor: Positive  # photons at the sensor over the clip's expected photons
-    ppp: NotNegative  # mean photons per pixel and code
-    before: NotNegative  # the same before the factor
-    lux: NotNegative | None = None  # faceplate lux at 555 nm
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +47,7 @@ class StreamInfo:
     settings: dict[str, Any] = field(default_factory=dict)  # of `Sensing`, where they differ from their defaults
     clip: str = ""  # its name
     clip_key: Count | None = None  # of the random numbers, beside the seed; None: not drawn from this clip
-    light: StreamLight | None = None  # None: not known
+    light: LightLevel | None = None  # of a code; None: not known
     drawn_by: str = ""  # law by which codes were drawn from random numbers (`Sensor.law`, or "events")
     dead_time_effects: Effects | None = None  # what the closed form of counting pixels leaves out
     planes_of: str = ""  # clip whose planes a study has summed

@@ -174,8 +174,9 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings, *, force: b
         assert summed is not None  # planes are summed at every depth
         draw = Draw(summed, level, key, Timing(m, summed=True), origin=clip.origin)
         # A code is one frame of `grouped`: its exposure is m times longer, which relative light does not know.
-        more, before = (m, 1) if clip.camera is None else (1, m)
-        of_code = replace(level, factor=more * level.factor, ppp=m * level.ppp, mean_before=before * level.mean_before)
+        of_code = level.over(m)
+        if clip.camera is None:
+            of_code = replace(of_code, factor=m * level.factor, before=level.before)
         info = describe(grouped, replace(read, sensor=draw.sensor), replace(draw, level=of_code, timing=Timing()))
         info = replace(info, planes_of=str(clip.path), drawn_by=draw.law, clip_key=None)  # `grouped` cannot draw it
         frames = (draw.frames(clip, t, t + 1) for t in range(len(grouped)))

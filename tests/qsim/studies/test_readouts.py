@@ -11,12 +11,12 @@ from sensor_files import QIS as QIS_FILE
 from sensor_files import sensor_file
 
 from qsim.cli.program import main
-from qsim.optics.radiometry import RGB
+from qsim.optics.radiometry import RGB, LightLevel
 from qsim.sensor.qis import QIS
 from qsim.sensor.spike import SpikeCamera
 from qsim.streams.photons import clip_photons
 from qsim.streams.storing import write_stream
-from qsim.streams.stream_info import StreamInfo, StreamLight
+from qsim.streams.stream_info import StreamInfo
 from qsim.studies.readouts import compare
 
 EXACT = QIS(quantum_efficiency=1.0, dark_current=0.0, read_noise=0.0, bits=9)
@@ -55,7 +55,7 @@ def test_each_stream_is_scored_at_the_middle_of_its_own_codes(tmp_path):
     for name, per_code in (("three", 3), ("seven", 7)):
         codes = light.reshape(-1, per_code, 12, 33).sum(axis=1).astype(np.uint16)
         rates = {"exposure": 5e-4 * per_code, "frame_rate": 2000 / per_code, "planes_per_code": per_code}
-        level = StreamLight(factor=1.0, ppp=float(codes.mean()), before=1.0)
+        level = LightLevel(factor=1.0, ppp=float(codes.mean()), before=1.0)
         write_stream(clip, name, codes, StreamInfo.of(EXACT, shape=codes.shape, light=level, **rates))
     found = compare(clip)
     assert found.instants == (3, 10, 17)
