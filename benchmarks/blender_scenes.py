@@ -170,7 +170,9 @@ def armature() -> None:
     first = bones.data.edit_bones[0]
     first.tail = (0, 0, 1.0)
     second = bones.data.edit_bones.new("second")
-    second.head, second.tail, second.parent = (0, 0, 1.0), (0, 0, 2.0), first
+    second.head = (0, 0, 1.0)
+    second.tail = (0, 0, 2.0)
+    second.parent = first
     bpy.ops.object.mode_set(mode="OBJECT")
     tube.select_set(True)
     bones.select_set(True)
@@ -459,7 +461,8 @@ def main() -> int:
     for name in options.only.split(",") if options.only else SCENES:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         scene = bpy.context.scene
-        scene.frame_start, scene.frame_end = 0, LAST
+        scene.frame_start = 0
+        scene.frame_end = LAST
         camera()
         floor()
         SCENES[name]()

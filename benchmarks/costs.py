@@ -79,7 +79,9 @@ def main(count: int) -> int:
             )
             found.append((max(cost(sensor, light) for light in lights), repr(sensor)))
         found.sort()
-        middle, late, (most, who) = found[count // 2][0], found[int(0.99 * count)][0], found[-1]
+        middle = found[count // 2][0]
+        late = found[int(0.99 * count)][0]
+        most, who = found[-1]
         print(f"{name}: {count} sensors, median {middle:.2f}, 99 % {late:.2f}, most {most:.2f} us per pixel: {who}")
         worst = max(worst, most)
     return 0 if worst <= BOUND else 1

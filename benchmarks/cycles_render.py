@@ -77,7 +77,9 @@ def add(data: Any) -> Any:
 def camera(description: dict[str, Any]) -> Any:
     """Return the camera, of the field of view of the description, as an object of the scene."""
     data = bpy.data.cameras.new("camera")
-    data.sensor_fit, data.sensor_width, data.clip_start = "HORIZONTAL", 36.0, 1e-3
+    data.sensor_fit = "HORIZONTAL"
+    data.sensor_width = 36.0
+    data.clip_start = 1e-3
     data.lens = 36.0 * description["focal_pixels"] / description["width"]
     bpy.context.scene.camera = add(data)
     return bpy.context.scene.camera
@@ -103,7 +105,8 @@ def picture(values: np.ndarray) -> Any:
     """Return an image of grey values [H, W], row 0 on top, which Cycles takes as they are."""
     height, width = values.shape
     image = bpy.data.images.new("picture", width, height, float_buffer=True)
-    image.colorspace_settings.name, image.use_half_precision = "Non-Color", False
+    image.colorspace_settings.name = "Non-Color"
+    image.use_half_precision = False
     four = np.repeat(values[::-1, :, None].astype(np.float32), 4, axis=2)
     four[..., 3] = 1
     image.pixels.foreach_set(four.ravel())
@@ -126,7 +129,8 @@ def material(body: dict[str, Any], found: dict[str, np.ndarray]) -> Any:
     tree, output = tree_of(coat, "ShaderNodeOutputMaterial")
     if body["material"] == "conductor":
         node = tree.nodes.new("ShaderNodeBsdfMetallic")
-        node.distribution, node.fresnel_type = "GGX", "PHYSICAL_CONDUCTOR"
+        node.distribution = "GGX"
+        node.fresnel_type = "PHYSICAL_CONDUCTOR"
         node.inputs["IOR"].default_value = [body["eta"]] * 3
         node.inputs["Extinction"].default_value = [body["k"]] * 3
         node.inputs["Roughness"].default_value = math.sqrt(body["alpha"])
@@ -134,7 +138,8 @@ def material(body: dict[str, Any], found: dict[str, np.ndarray]) -> Any:
         node = tree.nodes.new("ShaderNodeBsdfDiffuse")
         if body["material"] == "textured":
             texture = tree.nodes.new("ShaderNodeTexImage")
-            texture.image, texture.extension = picture(found["texture"]), "REPEAT"
+            texture.image = picture(found["texture"])
+            texture.extension = "REPEAT"
             texture.interpolation = "Closest" if body["nearest"] else "Linear"
             tree.links.new(texture.outputs["Color"], node.inputs["Color"])
         else:
@@ -147,7 +152,8 @@ def lamp(light: dict[str, Any], poses: np.ndarray) -> Moving:
     """Return an area lamp and its black back, which hides what is behind it, as objects with matrices."""
     sizes = 2 * np.linalg.norm(poses[0, :3, :2], axis=0)
     data = bpy.data.lights.new("lamp", "AREA")
-    data.shape, data.size, data.size_y = "RECTANGLE", *sizes.tolist()
+    data.shape = "RECTANGLE"
+    data.size, data.size_y = sizes.tolist()
     data.energy = light["radiance"] * math.pi * float(np.prod(sizes))
     rigid = poses @ np.diag([*(2 / sizes), 1, 1])
     x, y = np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * sizes[:, None] / 2
@@ -177,23 +183,32 @@ def configure(description: dict[str, Any], options: argparse.Namespace) -> None:
     scene = bpy.context.scene
     render = scene.render
     cycles = scene.cycles
-    render.engine, cycles.device = "CYCLES", "CPU"
-    render.threads_mode, render.threads = "FIXED", options.threads
-    render.resolution_x, render.resolution_y = description["width"], description["height"]
-    render.resolution_percentage, render.use_persistent_data = 100, True
+    render.engine = "CYCLES"
+    cycles.device = "CPU"
+    render.threads_mode = "FIXED"
+    render.threads = options.threads
+    render.resolution_x = description["width"]
+    render.resolution_y = description["height"]
+    render.resolution_percentage = 100
+    render.use_persistent_data = True
     render.use_compositing = render.use_sequencer = False
     scene.view_settings.view_transform = "Raw"
-    scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
-    cycles.samples, cycles.seed, cycles.use_adaptive_sampling = options.samples, options.seed, False
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.image_settings.color_depth = "32"
+    cycles.samples = options.samples
+    cycles.seed = options.seed
+    cycles.use_adaptive_sampling = False
     # Less time for the same error on scenes of one lamp, and less error of denoised pictures in the same time
-    cycles.use_light_tree, cycles.sampling_pattern = False, "BLUE_NOISE"
+    cycles.use_light_tree = False
+    cycles.sampling_pattern = "BLUE_NOISE"
     cycles.pixel_filter_type = "BOX"
     cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = options.bounces - 1  # beyond the first hit
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
     cycles.blur_glossy = cycles.light_sampling_threshold = 0.0
     cycles.use_denoising = options.denoise is not None
     if options.denoise is not None:
-        cycles.denoiser, cycles.denoising_input_passes = "OPENIMAGEDENOISE", "RGB_ALBEDO_NORMAL"
+        cycles.denoiser = "OPENIMAGEDENOISE"
+        cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
         cycles.denoising_prefilter, cycles.denoising_quality = options.denoise.split("/")
 
 

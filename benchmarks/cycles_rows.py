@@ -88,7 +88,9 @@ class Cycles:
     """The other program, on one neutral file."""
 
     def __init__(self, python: str, folder: Path, plan: Plan) -> None:
-        self.scene, self._out, self._plan = folder / "scene.npz", folder / "out.npz", plan
+        self.scene = folder / "scene.npz"
+        self._out = folder / "out.npz"
+        self._plan = plan
         self._start = [python, str(ROOT / "benchmarks" / "cycles_render.py"), str(self.scene), str(self._out)]
 
     def render(self, samples: int, bounces: int, *options: str) -> dict[str, Array]:
@@ -120,7 +122,8 @@ class Ours:
         self.budget = choose_budget(scene, frames=plan.frames, psnr=plan.level, seed=plan.seed, reuse=reuse)
         self.choosing = time.process_time() - started
         self.renderer = Renderer(scene, budget=self.budget, seed=plan.seed, frames=plan.frames)
-        self._plan, self.timed = plan, Timed()
+        self._plan = plan
+        self.timed = Timed()
 
     def render(self) -> None:
         """Render the clip once."""

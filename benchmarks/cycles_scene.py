@@ -66,7 +66,8 @@ def _body(body: Body, times: Sequence[float], name: str, arrays: dict[str, Array
         raise ValueError(f"body {body.name}: it deforms, and a neutral file holds rigid bodies")
     corners = body.mesh.vertices[body.mesh.faces]
     seen = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > 0
-    arrays[f"{name}_vertices"], arrays[f"{name}_faces"] = body.mesh.vertices, body.mesh.faces[seen]
+    arrays[f"{name}_vertices"] = body.mesh.vertices
+    arrays[f"{name}_faces"] = body.mesh.faces[seen]
     arrays[f"{name}_poses"] = np.stack([body.pose(t) for t in times])
     if body.mesh.smooth:
         arrays[f"{name}_normals"] = vertex_normals(body.mesh.vertices, body.mesh.faces)
@@ -74,7 +75,8 @@ def _body(body: Body, times: Sequence[float], name: str, arrays: dict[str, Array
         case Diffuse(Texture(repeat=repeat, nearest=nearest) as texture, None):
             if body.mesh.uv is None:
                 raise ValueError(f"body {body.name}: its mesh has no texture coordinates")
-            arrays[f"{name}_texture"], arrays[f"{name}_uv"] = texture.pixels(), body.mesh.uv * repeat
+            arrays[f"{name}_texture"] = texture.pixels()
+            arrays[f"{name}_uv"] = body.mesh.uv * repeat
             return {"material": "textured", "nearest": nearest}
         case Diffuse(float(reflectance), None):
             return {"material": "diffuse", "reflectance": reflectance}

@@ -93,7 +93,8 @@ class Clip:
         started = time.process_time()
         frame = self.renderer.frame(t, with_truth=False)
         self.seconds[t] = time.process_time() - started
-        self.images[t], self.errors[t] = frame.radiance.astype(np.float64), frame.errors_at
+        self.images[t] = frame.radiance.astype(np.float64)
+        self.errors[t] = frame.errors_at
 
     def row(self, plan: Plan, references: dict[int, Array], white: float) -> dict[str, Any]:
         """Return what was measured, by the references [2, H, W] of the judged frames."""

@@ -30,7 +30,8 @@ def main(names: list[str]) -> None:
     if unknown:
         sys.exit(f"run_examples: no example is called {unknown[0]!r}; known are {', '.join(p.stem for p in paths)}")
     for path in paths:
-        name, source = path.stem, path.read_text(encoding="utf-8")
+        name = path.stem
+        source = path.read_text(encoding="utf-8")
         code = examples.digest(source)
         if name in names or (not names and examples.stored(name).get("code") != code):
             print(name, flush=True)

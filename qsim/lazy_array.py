@@ -22,7 +22,10 @@ class LazyArray(NDArrayOperatorsMixin):
     def __init__(
         self, shape: tuple[int, ...], dtype: np.dtype[Any], read: Callable[[int, int, Crop | None], Array]
     ) -> None:
-        self.shape, self.dtype, self.ndim, self._read = shape, dtype, len(shape), read
+        self.shape = shape
+        self.dtype = dtype
+        self.ndim = len(shape)
+        self._read = read
 
     def __call__(self, start: int = 0, stop: int | None = None, crop: Crop | None = None) -> Array:
         """Return frames start ... stop - 1, [stop - start, h, w]; crop = (y, x, height, width) [px]."""

@@ -99,7 +99,8 @@ def _data(job: Job) -> list[dict[str, Any]]:
     def note(result: Any) -> None:
         nonlocal last
         if result.state == "done":
-            seconds[result.name], last = time.perf_counter() - last, time.perf_counter()
+            seconds[result.name] = time.perf_counter() - last
+            last = time.perf_counter()
             write(spent, seconds)
         if job.is_over():
             raise _Over

@@ -99,7 +99,8 @@ def spad_flats(flats: Sequence[FrameStatistics], darks: DarkRates | None, hot: A
             continue
         here = response.at(flat.exposure)
         mean = flat.total / flat.frames
-        dark, of_rate = (np.zeros(mean.shape), 0.0) if darks is None else (darks.rate * flat.exposure, darks.variance)
+        dark = np.zeros(mean.shape) if darks is None else darks.rate * flat.exposure
+        of_rate = 0.0 if darks is None else darks.variance
         average = float(dark[good].mean())
         arrivals = response.of_stack(flat).value
         largest = max(float(arrivals[good].max()), 1e-9)

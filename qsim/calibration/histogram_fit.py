@@ -62,7 +62,9 @@ class Likelihood:
     """The likelihood of all cells, as a function of the parameters."""
 
     def __init__(self, cells: Sequence[Cell], exposures: Sequence[float], darks: int, bits: int, start: Array) -> None:
-        self.cells, self.bits, self.darks = tuple(cells), bits, darks
+        self.cells = tuple(cells)
+        self.bits = bits
+        self.darks = darks
         longest = max(exposures[:darks])
         self.share = np.array([exposures[c.stack] / longest if c.stack < darks else 0.0 for c in cells])
         self.dark = np.array([c.stack < darks for c in cells])

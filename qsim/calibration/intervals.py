@@ -81,8 +81,12 @@ class _Search:
     """The signed root of the likelihood along one direction of the parameters."""
 
     def __init__(self, fit: Fit, direction: Array, scale: float, value: float, error: float, farthest: float) -> None:
-        self.fit, self.direction, self.scale = fit, direction, scale
-        self.value, self.error, self.farthest = value, error, farthest
+        self.fit = fit
+        self.direction = direction
+        self.scale = scale
+        self.value = value
+        self.error = error
+        self.farthest = farthest
         along = fit.inverse @ direction
         size = float(direction @ along)
         self.along = along / size if size > 0 else direction / float(direction @ direction)

@@ -219,7 +219,8 @@ def difference_interval(first: float, of_first: float, second: float, of_second:
         freedom = max(2 * value**2 / variance, 1.0)
         return 1 - freedom / chi2_quantile(0.975, freedom), freedom / chi2_quantile(0.025, freedom) - 1
 
-    (down, up), (down_noise, up_noise) = reach(first, of_first), reach(second, of_second)
+    down, up = reach(first, of_first)
+    down_noise, up_noise = reach(second, of_second)
     low = first - second - sqrt((down * first) ** 2 + (up_noise * second) ** 2)
     most = max(first, second)  # the upper end is at least that of data without any pattern
     return low, most - second + sqrt((up * most) ** 2 + (down_noise * second) ** 2)
@@ -229,7 +230,8 @@ class _Model:
     """Variance between pixels of one expected code that a PRNU causes, from the response curve."""
 
     def __init__(self, flat: Flat) -> None:
-        self.light, self.codes = flat.light, flat.codes
+        self.light = flat.light
+        self.codes = flat.codes
         self.grid = np.linspace(0, np.sqrt(flat.light[-1] / WIDEST), 400) ** 2
 
     def variance(self, expected: Array, s: float) -> Array:

@@ -277,13 +277,15 @@ def _number(word: str) -> float:
 def _stack(words: tuple[str, ...], asked: Calibrate, layout: Layout, sums: PlaneSums, *, dark: bool) -> Any:
     from qsim.calibration.sensor_file import read_stack
 
-    kind, most = ("--dark", 2) if dark else ("--flat", 3)
+    kind = "--dark" if dark else "--flat"
+    most = 2 if dark else 3
     if not 2 <= len(words) <= most:
         raise ValueError(
             f"{kind} {' '.join(words)}: give a file and its exposure in seconds, as in {kind} frames.npy 1e-3"
         )
     numbers = [_number(word) for word in words[1:]]
-    photons = 0.0 if dark else numbers[1] if len(numbers) > 1 else None
+    stated = numbers[1] if len(numbers) > 1 else None
+    photons = 0.0 if dark else stated
     return read_stack(
         Path(words[0]),
         bits=asked.bits or 1,

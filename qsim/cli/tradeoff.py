@@ -239,7 +239,8 @@ def _tradeoff_study(asked: Tradeoff) -> int:
     result = done.result
     text = done.text
     if asked.px:
-        result["px_asked"], result["speeds_found"] = asked.px, speeds
+        result["px_asked"] = asked.px
+        result["speeds_found"] = speeds
         text = [f"--px {px:g}: speed factor {speed:g}" for px, speed in zip(asked.px, speeds, strict=True)] + text
     if asked.streams:
         running().after_interrupt = MAKES_AGAIN
@@ -372,7 +373,8 @@ def _paper_figure(asked: Tradeoff) -> int:
     speeds = asked.speed or [1.0]
     if len(speeds) > 1:
         raise ValueError(f"--speed {asked.speed}: --paper-figure draws one speed; give one")
-    rate, frames = (paper_figures.RATE_1, 201) if number == 1 else (10_000.0, 511)
+    rate = paper_figures.RATE_1 if number == 1 else 10_000.0
+    frames = 201 if number == 1 else 511
     shape = study_clips.ClipShape(frames, height, width, rate, seed=asked.draws)
     names = ["fan"] if number == 1 else ["fan", "text"]
     if asked.source:

@@ -44,7 +44,9 @@ class Cluster:
     """
 
     def __init__(self, address: str, *, gpus: float = 0, timeout: float = 10.0) -> None:
-        self.address, self.gpus, self.timeout = address, gpus, timeout
+        self.address = address
+        self.gpus = gpus
+        self.timeout = timeout
 
     def __call__(self, jobs: Iterable[Job], folder: Path, make: RenderJob) -> Generator[Result]:
         distributed = _distributed()

@@ -132,7 +132,10 @@ def load_scene(
     scene: Scene | str | os.PathLike[str], seed: int, speed: float | None, settings: RenderSettings
 ) -> tuple[Scene, dict[str, str]]:
     """Return a scene in its size, and the SHA-256 of each file that it reads; arguments and errors as of `render`."""
-    height, width, bands, path = settings.height, settings.width, settings.bands, settings.camera_path
+    height = settings.height
+    width = settings.width
+    bands = settings.bands
+    path = settings.camera_path
     if isinstance(scene, Scene):
         if speed is not None:
             raise ValueError(f"scene {scene.name}: a Scene has its motions already; leave speed= out")

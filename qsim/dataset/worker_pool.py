@@ -124,7 +124,8 @@ class _Worker:
     def take(self) -> tuple[Job, Result | None]:
         """Wait for the result and return it with the job; None in its place if the process crashed."""
         assert self.job is not None
-        job, self.job = self.job, None
+        job = self.job
+        self.job = None
         try:
             return job, self.pipe.recv()
         except (EOFError, ConnectionResetError):

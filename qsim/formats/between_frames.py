@@ -50,7 +50,9 @@ class Between:
         self._forward = search.calc(shown[0], shown[1], None)
         self._back = search.calc(shown[1], shown[0], None)
         height, width = self._light[0].shape
-        self._y, self._x = np.mgrid[:height, :width].astype(np.float32)
+        places = np.mgrid[:height, :width].astype(np.float32)
+        self._y = places[0]
+        self._x = places[1]
         self._seen = [  # 1 where the other frame shows the same point
             self._returns(self._forward, self._back),
             self._returns(self._back, self._forward),

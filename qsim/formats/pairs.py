@@ -171,7 +171,9 @@ def _fill(group: Any, listed: Sequence[Window]) -> Iterator[None]:
         values = [fact[name] for fact in facts]
         group.create_dataset(name, data=values, dtype=h5py.string_dtype() if isinstance(values[0], str) else None)
     for n, window in enumerate(listed):
-        arrays["codes"][n], arrays["truth"][n], arrays["flow"][n] = window.codes(), window.truth(), window.flow()
+        arrays["codes"][n] = window.codes()
+        arrays["truth"][n] = window.truth()
+        arrays["flow"][n] = window.flow()
         yield
 
 

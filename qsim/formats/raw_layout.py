@@ -46,8 +46,9 @@ class Layout:
     @property
     def row_bits(self) -> int:
         """The bits of a row, without bytes after it."""
-        each = 12 if self.pairs else self.bits if self.order is not None else 8 * self.pixel_bytes
-        return self.width * each
+        if self.pairs:
+            return self.width * 12
+        return self.width * (self.bits if self.order is not None else 8 * self.pixel_bytes)
 
     @property
     def pixel_bytes(self) -> int:
@@ -92,8 +93,10 @@ class Layout:
             return _pixel_pairs(rows, self.bits)
         if self.order is not None:
             return _bit_stream(rows, count, self.bits, self.order)
-        kind = np.dtype("u1" if self.pixel_bytes == 1 else "<u2" if self.endian == "little" else ">u2")
-        return (rows.view(kind) >> self.shift).astype(np.uint8 if self.pixel_bytes == 1 else np.uint16)
+        if self.pixel_bytes == 1:
+            return rows.view(np.uint8) >> self.shift
+        kind = np.dtype("<u2" if self.endian == "little" else ">u2")
+        return (rows.view(kind) >> self.shift).astype(np.uint16)
 
 
 def _bit_stream(rows: Array, count: int, bits: int, order: str) -> Array:

@@ -106,7 +106,8 @@ class _Decoder:
     """Decodes frames in order; an earlier frame starts again at the first."""
 
     def __init__(self, path: Path, about: Facts) -> None:
-        self.path, self.about = path, about
+        self.path = path
+        self.about = about
         self.next = 0
         self.source: Iterator[Array] | None = None
 

@@ -172,4 +172,6 @@ def blur_error(extent: float, instants: int) -> float:
     ghosts of 1 / K.
     """
     step = extent / instants
-    return step**2 / (8 * extent) if 0 < step <= 1 else 1 / instants if step > 1 else 0.0
+    if step > 1:
+        return 1 / instants
+    return step**2 / (8 * extent) if step > 0 else 0.0

@@ -25,7 +25,10 @@ class Film:
     """
 
     def __init__(self, mi: Any, camera: Camera, crop: Crop, thinned: int, rays: CameraRays | None) -> None:
-        self._mi, self.camera, self.crop, self.thinned = mi, camera, crop, thinned
+        self._mi = mi
+        self.camera = camera
+        self.crop = crop
+        self.thinned = thinned
         self.shape = -(-crop[2] // thinned), -(-crop[3] // thinned)
         self._samplers: dict[int, Any] = {}
         self.rays: Any = rays
@@ -33,7 +36,9 @@ class Film:
     def window(self, crop: Crop) -> Film:
         """Return the film of every pixel of another crop; it shares the samplers."""
         other = copy.copy(self)
-        other.crop, other.thinned, other.shape = crop, 1, crop[2:]
+        other.crop = crop
+        other.thinned = 1
+        other.shape = crop[2:]
         return other
 
     def parts(self, samples: int) -> list[range]:
@@ -151,7 +156,8 @@ class _Warp:
     def __init__(self, mi: Any, camera: Camera, lens: Lens) -> None:
         import drjit as dr
 
-        (x, y), f = camera.axis, camera.focal_pixels
+        x, y = camera.axis
+        f = camera.focal_pixels
         columns, lines = (np.linspace(0.0, size, GRID) for size in (camera.width, camera.height))
         places = np.stack(np.meshgrid((columns - x) / f, (lines - y) / f), axis=-1)
         known = lens.traced(places).astype(np.float32)

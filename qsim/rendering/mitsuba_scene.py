@@ -41,7 +41,8 @@ class Stage:
 
     def __init__(self, mi: Any, scene: Scene, smooth_weight: float = SMOOTH_WEIGHT) -> None:
         """Load the scene; a `smooth_weight` of 1 is Mitsuba's default."""
-        self.mi, self.scene = mi, scene
+        self.mi = mi
+        self.scene = scene
         self.variant: str = mi.variant()
         self.loaded = (
             mi.load_dict(_scene_dict(mi, scene, smooth_weight))
@@ -401,9 +402,9 @@ def _bsdf(mi: Any, material: materials.Material) -> dict[str, Any]:
             if roughness > 0:
                 inner |= {"type": "roughconductor", "alpha": roughness, "distribution": "ggx"}
         case materials.Dielectric(ior, roughness, thin):
-            kind = "thindielectric" if thin else "roughdielectric" if roughness > 0 else "dielectric"
-            rough = {"alpha": roughness, "distribution": "ggx"} if kind == "roughdielectric" else {}
-            return {"type": kind, "int_ior": ior} | rough
+            if roughness > 0 and not thin:
+                return {"type": "roughdielectric", "int_ior": ior, "alpha": roughness, "distribution": "ggx"}
+            return {"type": "thindielectric" if thin else "dielectric", "int_ior": ior}
         case materials.MetallicRoughness():
             return _metallic_roughness(mi, material)
         case _:

@@ -256,7 +256,8 @@ def denoised_samples(
             break
     faster = min(trials[0].get(quality, math.inf) for quality in ("balanced", "fast"))
     if tried[0] > FEWEST * count and faster * RISE <= share:
-        tried, trials = [FEWEST * count, *tried], [trial(FEWEST * count), *trials]
+        tried = [FEWEST * count, *tried]
+        trials = [trial(FEWEST * count), *trials]
     errors = {quality: [one[quality] for one in trials if quality in one] for quality in DENOISE_COST}
     size = f"tried in {'' if len(parts) == 1 else 'four windows of '}frame {t}"
     options = _enough(tried, errors, share, trials_of)

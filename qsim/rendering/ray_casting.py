@@ -41,7 +41,9 @@ class RayCaster:
     """First hits in a loaded scene at its current time; the scalar engine casts one ray after the other."""
 
     def __init__(self, stage: Stage, backend: str) -> None:
-        self._mi, self._stage, self._scalar = stage.mi, stage, backend == "scalar"
+        self._mi = stage.mi
+        self._stage = stage
+        self._scalar = backend == "scalar"
         self._numbers = self._shape_table(stage.shape_numbers(), -1)
         self._first_faces = self._shape_table(stage.first_faces(), 0)
 
@@ -132,7 +134,8 @@ class RayCaster:
             if found.is_valid():
                 name = (found.instance or found.shape).id()
                 number[i] = numbers.get(name, -1)
-                triangle[i], weights[i] = found.prim_index + first_faces.get(name, 0), found.prim_uv
+                triangle[i] = found.prim_index + first_faces.get(name, 0)
+                weights[i] = found.prim_uv
                 distance[i] = found.t / length if number[i] >= 0 else np.inf
         return Hits(distance, number, triangle, weights)
 

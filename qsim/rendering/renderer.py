@@ -102,7 +102,10 @@ class Renderer:
             raise ValueError(f"frame_rate: a positive number of frames per second is needed, got {frame_rate!r}")
         if not 0 <= shutter <= 1:
             raise ValueError(f"shutter: a share of the frame time, 0 to 1, got {shutter!r}")
-        self.scene, self.frame_rate, self.shutter, self.seed = scene, frame_rate, shutter, seed
+        self.scene = scene
+        self.frame_rate = frame_rate
+        self.shutter = shutter
+        self.seed = seed
         self.budget = budget or Budget()
         self.engine = (engine or select()) if scene.bands is None else in_colour(engine or select())
         activate(self.engine)

@@ -147,9 +147,10 @@ def stream_line(stream: Stream) -> str:
     efficiency = stream.sensor.efficiency
     colours = stream.colour_filter
     if ppp is not None:
-        electrons = efficiency if colours is None else colours.mean_efficiency(efficiency)
-        about, bands = ("", "") if colours is None else ("about ", " with equal bands")
-        light += f", {about}{ppp * electrons:.3g} e⁻ per pixel{bands}"
+        if colours is None:
+            light += f", {ppp * efficiency:.3g} e⁻ per pixel"
+        else:
+            light += f", about {ppp * colours.mean_efficiency(efficiency):.3g} e⁻ per pixel with equal bands"
     filters = "" if colours is None else f"; colour filters {' '.join(colours.mask)}"
     words = f"{filters}{timing_words(stream)}{defects_words(stream)}"
     return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{words}"

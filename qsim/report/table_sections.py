@@ -154,8 +154,8 @@ def _winner(lines: list[dict[str, Any]], plan: dict[str, Any]) -> str:
         return ""
     best = [f"{_pm(line['scores']['psnr_matched'], 1)} dB by {line['method']} at {line['light']}" for line in lines]
     split = "test" if plan.get("test_set") else plan.get("split")
-    kind = "training" if split == "train" else "held-out" if split in ("val", "test") else None
-    start = "The" if kind is None else f"On {kind} clips the"
+    kinds = {"train": "training", "val": "held-out", "test": "held-out"}
+    start = f"On {kinds[split]} clips the" if split in kinds else "The"
     return f"{start} best matched PSNR is {', '.join(best)}."
 
 

@@ -200,7 +200,8 @@ def camera_path(
 
 def _intrinsics(camera: Camera, origin: tuple[int, int]) -> dict[str, float]:
     """Return focal lengths, principal point and distortion of a camera without zoom, as a file states them."""
-    lens, (x, y) = camera.lens or Lens(), camera.axis
+    lens = camera.lens or Lens()
+    x, y = camera.axis
     return {
         "fl_x": camera.focal_pixels * lens.aspect,
         "fl_y": camera.focal_pixels,

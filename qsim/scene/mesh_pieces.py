@@ -113,9 +113,11 @@ def texture_of(paint: Paint, coordinates: Sequence[Array]) -> Texture:
                 )
             wrap[axis] = wrap[axis].replace("clamp", "mirror")
         if wrap == ["mirror", "repeat"]:
-            colours, repeat[0] = np.concatenate([colours, colours[:, ::-1]], axis=1), 0.5
+            colours = np.concatenate([colours, colours[:, ::-1]], axis=1)
+            repeat[0] = 0.5
         elif wrap == ["repeat", "mirror"]:
-            colours, repeat[1] = np.concatenate([colours[::-1], colours], axis=0), 0.5
+            colours = np.concatenate([colours[::-1], colours], axis=0)
+            repeat[1] = 0.5
         wrap = ["mirror" if wrap[0] == wrap[1] else "repeat"]
     return Texture(
         Picture(np.ascontiguousarray(colours)),

@@ -305,7 +305,9 @@ def _outside_is_right(loop: Array, loops: Sequence[Array]) -> bool:
 
 def _contains(loop: Array, point: Array) -> bool:
     """Return whether a point lies inside one closed loop (even-odd)."""
-    (x, y), p, q = point, loop, np.roll(loop, -1, axis=0)
+    x, y = point
+    p = loop
+    q = np.roll(loop, -1, axis=0)
     straddles = (p[:, 1] > y) != (q[:, 1] > y)
     p = p[straddles]
     q = q[straddles]

@@ -41,7 +41,8 @@ def search(passed: Callable[[Array, Array], Array], top: int, guess: Array) -> A
     while left.size:
         k = probe[left]
         up = passed(k, left)
-        low[left], high[left] = np.where(up, k, low[left]), np.where(up, high[left], k)
+        low[left] = np.where(up, k, low[left])
+        high[left] = np.where(up, high[left], k)
         below = low[left]
         above = high[left]
         probe[left] = np.where(

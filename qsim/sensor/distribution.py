@@ -245,7 +245,9 @@ def require_number(record: Any, name: str, low: float, high: float = np.inf, *, 
     number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     if not (number and isfinite(value) and (value > low if open_low else value >= low) and value <= high):
         least = f"above {low:g}" if open_low else f"at least {low:g}"
-        limits = "finite" if low == -np.inf else least if high == np.inf else f"{least} and at most {high:g}"
+        limits = least if high == np.inf else f"{least} and at most {high:g}"
+        if low == -np.inf:
+            limits = "finite"
         raise ValueError(f"{type(record).__name__}.{name} is a number, {limits}; got {value!r}")
     object.__setattr__(record, name, float(value))
 

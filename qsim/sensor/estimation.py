@@ -300,7 +300,8 @@ def _root(function: Callable[[Array, Array], Array], low: Array, high: Array, ro
         return np.nan_to_num(found, nan=-_HUGE, posinf=_HUGE, neginf=-_HUGE)
 
     which = np.arange(len(rows))
-    f_low, f_high = bounded(low, which), bounded(high, which)
+    f_low = bounded(low, which)
+    f_high = bounded(high, which)
     low, high = np.where(f_high >= 0, high, low), np.where(f_low <= 0, low, high)
     open_ = low < high
     result = low.copy()

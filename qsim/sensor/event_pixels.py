@@ -38,7 +38,8 @@ from qsim import limits
 from qsim.keys import Key, hash_name, normal, require_counters, uniform, uniform_pair, words, words_at
 from qsim.sensor.event_camera import LEAST_THRESHOLD, EventCamera
 
-OFF, ON = 0, 1
+OFF = 0
+ON = 1
 REACHED = 1e-9  # of a threshold, by which a change may miss it
 _DEVICE = hash_name("event camera")  # clip of the keys of thresholds
 _PHASE = hash_name("event camera: phase of the leak")

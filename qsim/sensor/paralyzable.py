@@ -68,7 +68,8 @@ class Paralyzable:
     """Cdf, log_pmf and slope of the clipped count for Poisson means [p]; `ratio` = exposure / dead time."""
 
     def __init__(self, ratio: float, levels: int) -> None:
-        self.ratio, self.levels = ratio, levels
+        self.ratio = ratio
+        self.levels = levels
         self.possible = min(levels, most_counts(ratio) + 1)  # levels that can occur
 
     def cdf(self, mean: Array) -> Array:
@@ -121,7 +122,8 @@ class Paralyzable:
             first[clipped], second[clipped] = summed(
                 light[clipped], first[clipped], reach[clipped], self.possible - 1, self._tail
             )
-        first[mean == 0], second[mean == 0] = 0.0, 0.0
+        first[mean == 0] = 0.0
+        second[mean == 0] = 0.0
         return first, np.maximum(second, 0.0)
 
     def _tail(self, codes: Array, mean: Array, below: Array) -> Array:
@@ -252,7 +254,9 @@ class _Paralysed:
     """
 
     def __init__(self, mean: Array, ratio: float, levels: int) -> None:
-        self.mean, self.levels, a = mean, levels, 1 / ratio
+        self.mean = mean
+        self.levels = levels
+        a = 1 / ratio
         self.log_rate = np.log(mean) - mean * a
         self.rate = np.exp(self.log_rate)
         if (self.rate * (1 - a) > _SPARSE).any():
@@ -441,5 +445,6 @@ def steps(ratio: float, count: int, mean: Array) -> tuple[Array, Array]:
         some = slice(start, start + _BLOCK // 4)
         power, factor, change = generating(log_z, mean[some], ratio)
         cdf = -np.exp(power) / (factor * np.expm1(log_z))
-        results[0][:, some], results[1][:, some] = (turned @ cdf).real, (turned @ (cdf * change)).real
+        results[0][:, some] = (turned @ cdf).real
+        results[1][:, some] = (turned @ (cdf * change)).real
     return results[0], results[1]

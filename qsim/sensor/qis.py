@@ -430,7 +430,8 @@ def _normal_thresholds(sensor: QIS, electrons: Array, codes: Array) -> Array:
     if sensor.read_noise == 0:
         return np.where(sensor.codes_of(electrons)[:, None] <= codes, inf, -inf)
     z = ((codes + 0.5 - sensor.offset) / sensor.gain - electrons[:, None]) / sensor.read_noise
-    z[:, codes < 0], z[:, codes >= sensor.levels - 1] = -inf, inf
+    z[:, codes < 0] = -inf
+    z[:, codes >= sensor.levels - 1] = inf
     return z
 
 

@@ -99,11 +99,9 @@ def _check_exposures(sensing: Sensing, sensor: Sensor, found: Defects | None) ->
     if sensor.keeps_charge:
         raise ValueError(f"exposures: {sensing.sensor_name} integrates without a pause; leave them out")
     if remembers or ((sensing.follow or sensing.slices > 1) and sensor.follows_photons):
-        what = (
-            "afterpulses and carried dead time"
-            if remembers
-            else f"{'followed photons' if sensing.follow else 'slices'} of a counting pixel"
-        )
+        what = "followed photons of a counting pixel" if sensing.follow else "slices of a counting pixel"
+        if remembers:
+            what = "afterpulses and carried dead time"
         raise ValueError(f"exposures: {what} need codes of equal exposure; leave one of them out")
 
 

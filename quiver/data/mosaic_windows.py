@@ -37,7 +37,8 @@ def places_of_turns(mask: tuple[str, ...], at_first: tuple[str, ...], side: int)
     The clip's first pixel lies at the first letter of `at_first`. A window [side, side], turned, has `mask` from its
     first pixel on.
     """
-    rows, columns = len(mask), len(mask[0])
+    rows = len(mask)
+    columns = len(mask[0])
     repeats = np.arange(side)
     letters = np.array([list(row) for row in mask])
     wanted = letters[repeats[:, None] % rows, repeats % columns]

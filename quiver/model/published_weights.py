@@ -185,7 +185,9 @@ def _read_foreign(path: Path) -> dict[str, Tensor]:
 
 def _some(names: object, count: int = 3) -> str:
     listed = [str(name) for name in names]  # type: ignore[attr-defined]
-    return ", ".join(listed[:count]) + (", ..." if len(listed) > count else "") if listed else "none"
+    if len(listed) > count:
+        listed = [*listed[:count], "..."]
+    return ", ".join(listed) or "none"
 
 
 # ---- Compared networks, whose layers have the published names
@@ -204,8 +206,8 @@ def load_published(network: nn.Module, state: Mapping[str, Tensor], unused: tupl
     missing = sorted(own.keys() - state.keys() - constants)
     unknown = sorted(state.keys() - own.keys() - set(left))
     if missing or unknown:
-        name, fault = (missing[0], "is missing") if missing else (unknown[0], "is unknown")
-        raise ValueError(f"not a published state of {title}: {name} {fault}; give all entries of the published network")
+        fault = f"{missing[0]} is missing" if missing else f"{unknown[0]} is unknown"
+        raise ValueError(f"not a published state of {title}: {fault}; give all entries of the published network")
     for name, value in state.items():
         if name in own and value.shape != own[name].shape:
             raise ValueError(

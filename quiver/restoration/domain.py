@@ -161,7 +161,10 @@ def table(domain: Domain) -> list[str]:
     for cell in domain.cells:
         ours = f"{cell.network:.2f}"
         theirs = f"{cell.classical_psnr:.2f}"
-        ours, theirs = (f"**{ours}**", theirs) if cell.wins else (ours, f"**{theirs}**")
+        if cell.wins:
+            ours = f"**{ours}**"
+        else:
+            theirs = f"**{theirs}**"
         rows.append((cell.sensor, str(cell.place.bits), f"{cell.ppp:g}", ours, f"{cell.classical} {theirs}"))
     return markdown_table(rows, ("sensor", "bits", "PPP", "network", "best classical method"))
 

@@ -39,7 +39,8 @@ def test_four_neighbours_share_a_block():
 
 @pytest.mark.parametrize("origin", [(0, 0), (0, 1), (3, 2), (5, 3), (7, 4), (2, 9)])
 def test_a_crop_has_the_words_of_the_whole(origin):
-    whole, (y, x) = words(Key(3, 4, 5), (17, 23), redraw=2), origin
+    whole = words(Key(3, 4, 5), (17, 23), redraw=2)
+    y, x = origin
     crop = words(Key(3, 4, 5), (8, 11), origin, redraw=2)
     np.testing.assert_array_equal(crop, whole[y : y + 8, x : x + 11])
 

@@ -25,7 +25,11 @@ class Page:
     """One tab; `problems` holds the uncaught errors of its scripts."""
 
     def __init__(self, send: int, receive: int) -> None:
-        self._send, self._receive, self._rest, self._number, self._session = send, receive, b"", 0, ""
+        self._send = send
+        self._receive = receive
+        self._rest = b""
+        self._number = 0
+        self._session = ""
         self.problems: list[str] = []
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]

@@ -175,7 +175,8 @@ def errors(name: str, golden: Mapping[str, np.ndarray], table: Path, prefix: str
         raise ValueError(f"codes are numbers {shapes}, got {codes.dtype} {list(codes.shape)}")
     if (codes < 0).any() or (codes > TOP).any() or (codes != np.floor(codes)).any():
         raise ValueError(f"codes are whole numbers 0 to {TOP}, got some of {codes.min()} to {codes.max()}")
-    multiple, (height, width) = getattr(network, "MULTIPLE", 1), codes.shape[-2:]
+    multiple = getattr(network, "MULTIPLE", 1)
+    height, width = codes.shape[-2:]
     if height % multiple or width % multiple:
         raise ValueError(f"{name} takes frames whose sides {multiple} divides, got {height} x {width}")
     if not golden.keys() - set(network.INPUTS):

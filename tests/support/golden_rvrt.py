@@ -19,7 +19,8 @@ def stages(arrays: Mapping[str, np.ndarray], weights: Mapping[str, Tensor]) -> d
 
     `ValueError` for an odd clip, and for frames so small that the coarsest flow of the port has one pixel.
     """
-    count, (height, width) = arrays["codes"].shape[1], arrays["codes"].shape[-2:]
+    count = arrays["codes"].shape[1]
+    height, width = arrays["codes"].shape[-2:]
     if count % CLIP:
         raise ValueError(f"rvrt takes an even number of frames, got {count}")
     network = built(weights)

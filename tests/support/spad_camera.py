@@ -46,7 +46,8 @@ def turned(picture: Array, shape: tuple[int, int], rate: float) -> Scene:
         y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
         y -= shape[0] / 2
         x -= shape[1] / 2
-        c, s = np.cos(rate * time), np.sin(rate * time)
+        c = np.cos(rate * time)
+        s = np.sin(rate * time)
         return map_coordinates(picture, [c * y - s * x, s * y + c * x], order=1, mode="grid-wrap")
 
     return light

@@ -114,7 +114,8 @@ class SPADCase:
                 frame[:] = np.minimum(frame + rng.binomial(before, self.afterpulsing), 2**self.bits - 1)
             return measure([codes[early:]], bits=self.bits, exposure=self.exposure, photons=light)
 
-        darks, flats = [stack(0.0, 4 * self.frames)], [stack(light, self.frames) for light in self.photons]
+        darks = [stack(0.0, 4 * self.frames)]
+        flats = [stack(light, self.frames) for light in self.photons]
         found = calibrate_spad(
             darks, flats, bits=self.bits, dead_time=not ignore_dead_time, paralyzable=self.paralyzable
         )

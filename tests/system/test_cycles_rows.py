@@ -235,7 +235,9 @@ class FakeClip:
     """Writes down when it is rendered, here and as Cycles; its error halves with four times the samples."""
 
     def __init__(self, name: str, log: list[str]) -> None:
-        self.name, self.log, self.budget = name, log, Budget(8, 4)
+        self.name = name
+        self.log = log
+        self.budget = Budget(8, 4)
 
     def render(self, samples: int = 0, bounces: int = 0, *options: str) -> dict[str, np.ndarray]:
         self.log.append(f"{self.name} {samples} {' '.join(options)}".strip() if samples else self.name)

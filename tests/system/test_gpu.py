@@ -68,7 +68,8 @@ class Bench:
     """A folder of results, faked measurements, and what they did."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.out = folder, folder / "out"
+        self.folder = folder
+        self.out = folder / "out"
         (folder / "fake.py").write_text(FAKE.format(parts=str(PARTS), here=str(folder)))
         self.child = (sys.executable, str(folder / "fake.py"))
         self.acts()

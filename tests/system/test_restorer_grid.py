@@ -38,7 +38,8 @@ def test_every_bin_has_its_own_rival_and_empty_bins_none():
     rows = told["scores"]["clip"]
     rows["naive"]["squares"][2] = 100 * 10 ** (-2.7)
     for row in rows.values():
-        row["pixels"][5], row["squares"][5] = 0, 0.0
+        row["pixels"][5] = 0
+        row["squares"][5] = 0.0
     bins = restorer_grid.compared(told)[3]
     np.testing.assert_allclose(bins[:5], [1.0, 1.0, -2.0, 1.0, 1.0], atol=1e-9)
     assert np.isnan(bins[5])

@@ -629,7 +629,8 @@ def stored() -> tuple[dict[str, str], dict[str, dict[str, str]], dict[str, Array
         arrays = {}
         for key, kind, shape in zip(*(file[name].tolist() for name in ("keys", "kinds", "shapes")), strict=True):
             size = int(np.prod(json.loads(shape)))
-            arrays[key], left[kind] = left[kind][:size].reshape(json.loads(shape)), left[kind][size:]
+            arrays[key] = left[kind][:size].reshape(json.loads(shape))
+            left[kind] = left[kind][size:]
     return made["software"], made["texts"], arrays
 
 

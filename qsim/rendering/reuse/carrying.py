@@ -162,7 +162,10 @@ class _Layers:
     def __init__(self, carrier: Carrier, t: int, target: Traced, mean: float) -> None:
         import drjit as dr
 
-        self.carrier, self.t, self.target, self.mi = carrier, t, target, carrier.stage.mi
+        self.carrier = carrier
+        self.t = t
+        self.target = target
+        self.mi = carrier.stage.mi
         self.pixels = math.prod(carrier.film.shape)
         hits = carrier.caster.cast(target.view, pixel_rays(carrier.film.camera, carrier.film.crop))
         self.inverse = self.mi.Float((1 / hits.distance).astype(np.float32))

@@ -123,6 +123,9 @@ def draw(rows: Sequence[Sequence[Panel]]) -> bytes:
             axes.set_axis_off()
             score = panel.numbers.get("psnr_db")
             motion = panel.numbers.get("motion_px_per_frame")
-            about = "" if score is None else f"\n{score:.1f} dB" + ("" if motion is None else f", {motion:.2g} px")
-            axes.set_title(panel.label + about, fontsize=8)
+            title = panel.label
+            if score is not None:
+                title += f"\n{score:.1f} dB"
+                title += "" if motion is None else f", {motion:.2g} px"
+            axes.set_title(title, fontsize=8)
     return figure_png(drawing)

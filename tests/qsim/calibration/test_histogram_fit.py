@@ -50,7 +50,8 @@ def test_moments_of_a_bright_cell_have_the_slopes_of_their_differences():
     slopes = law.slopes(2.0, 3.0, at[3:])
     score = law.score(*moments(at), *slopes)
     for k, step in enumerate(1e-5 * np.eye(4)):
-        above, below = moments(at + step), moments(at - step)
+        above = moments(at + step)
+        below = moments(at - step)
         for slope, high, low in zip(slopes, above, below, strict=True):
             np.testing.assert_allclose(slope[k], (high - low) / 2e-5, rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(score[k].sum(), (law.value(*above) - law.value(*below)) / 2e-5, rtol=1e-4)

@@ -36,7 +36,8 @@ class FullDisk:
 
 class _Limited:
     def __init__(self, file: Any, disk: FullDisk) -> None:
-        self.file, self.disk = file, disk
+        self.file = file
+        self.disk = disk
 
     def write(self, content: Any) -> int:
         fits = min(len(content), self.disk.space)
@@ -107,7 +108,8 @@ class FullAt:
 
 class _Guarded:
     def __init__(self, file: Any, write: Callable[..., Any]) -> None:
-        self.file, self.write = file, write
+        self.file = file
+        self.write = write
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.file, name)

@@ -103,7 +103,9 @@ def test_hdf5_reads_only_what_lies_in_the_file(tmp_path: Path):
     with h5py.File(other, "w") as file:
         file["secret"] = frames
     with h5py.File(path, "w") as file:
-        file["run/one"], file["run/two"], file["dark"] = frames, frames, frames[0]
+        file["run/one"] = frames
+        file["run/two"] = frames
+        file["dark"] = frames[0]
         file["outside"] = h5py.ExternalLink(str(other), "/secret")
         file["soft"] = h5py.SoftLink("/run/one")
         layout = h5py.VirtualLayout(frames.shape, frames.dtype)

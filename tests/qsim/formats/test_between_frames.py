@@ -56,7 +56,8 @@ def test_moving_textures_are_nearer_than_by_blending_and_repeating(share: float)
 
 def test_hidden_points_have_the_light_of_the_frame_that_sees_them():
     """Without motion, where both ends differ: one frame where only its flow does not return, else both by the share."""
-    first, second = np.full((24, 24), 0.2), np.full((24, 24), 0.9)
+    first = np.full((24, 24), 0.2)
+    second = np.full((24, 24), 0.9)
     between = Between(first, second)
     between._forward = between._back = np.zeros((24, 24, 2), np.float32)
     returns = np.ones((2, 24, 24), np.float32)
@@ -83,7 +84,8 @@ def test_still_light_stays_and_flicker_is_linear():
 
 def test_time_runs_both_ways():
     """Frames in reverse give the same light, as all weights are symmetric."""
-    first, second = squares(0.0), squares(1.0)
+    first = squares(0.0)
+    second = squares(1.0)
     there, _ = Between(first, second).at(0.3)
     back, _ = Between(second, first).at(0.7)
     assert rms(there, back) < 0.02 * rms(first, second)

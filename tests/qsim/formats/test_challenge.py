@@ -79,7 +79,8 @@ def test_golden_bytes(tmp_path):
         np.save(stream.path, np.packbits(codes, axis=2))
     exporting.export(clip, tmp_path / "out", Export("challenge", planes=1))
     expected = np.zeros((1, 2, 2, 3), np.uint8)
-    expected[0, 0, 0, 0], expected[0, 1, 1, 2] = 0x80, 0x40
+    expected[0, 0, 0, 0] = 0x80
+    expected[0, 1, 1, 2] = 0x40
     np.testing.assert_array_equal(np.load(tmp_path / "out" / "000000.npy"), expected)
 
 

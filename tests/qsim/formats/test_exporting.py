@@ -36,7 +36,9 @@ from qsim.streams.clip import Clip
 @pytest.mark.parametrize("width", [1, 7, 10, 33, 70])
 def test_codes_through_our_stream_and_every_export(tmp_path: Path, bits: int, width: int):
     codes = np.random.default_rng(bits).integers(0, 2**bits, (3, 5, width)).astype(np.uint8)
-    codes[0, 0, 0], codes[0, 1, 0], codes[0, 2, 0] = 0, 1, 2**bits - 1
+    codes[0, 0, 0] = 0
+    codes[0, 1, 0] = 1
+    codes[0, 2, 0] = 2**bits - 1
     np.save(tmp_path / "codes.npy", codes)
     recording = importing.read(tmp_path / "codes.npy", Hints("codes", bits=bits))
     stream = importing.to_stream(recording, tmp_path / "s", CAPTURE)

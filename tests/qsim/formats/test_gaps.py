@@ -85,11 +85,14 @@ def test_lost_frames_of_videos_are_told(tmp_path: Path):
     for name in ("a.mp4", "a.mkv"):
         with av.open(tmp_path / name, "w") as container:
             stream = container.add_stream("libx264", rate=100)
-            stream.height, stream.width, stream.pix_fmt = 32, 48, "yuv420p"
+            stream.height = 32
+            stream.width = 48
+            stream.pix_fmt = "yuv420p"
             stream.codec_context.time_base = Fraction(1, 100)
             for t in (0, 1, 2, 3, 7, 8, 9, 10):
                 frame = av.VideoFrame.from_ndarray(np.full((32, 48, 3), 20 * t, np.uint8), format="rgb24")
-                frame.pts, frame.time_base = t, Fraction(1, 100)
+                frame.pts = t
+                frame.time_base = Fraction(1, 100)
                 container.mux(stream.encode(frame))
             container.mux(stream.encode())
         with pytest.warns(UserWarning, match=r"presentation times of the video: 3 frames are lost: 3 between 0.03 and"):

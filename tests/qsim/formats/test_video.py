@@ -80,7 +80,8 @@ def write_deep_video(path: Path, stored: np.ndarray, kind: str, height: int | No
 
     with av.open(str(path), "w") as container:
         stream = container.add_stream("ffv1", rate=30)
-        stream.height, stream.width = height or stored.shape[1], stored.shape[2]
+        stream.height = height or stored.shape[1]
+        stream.width = stored.shape[2]
         stream.codec_context.pix_fmt = kind
         for image in stored:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format=kind)))

@@ -78,7 +78,8 @@ def test_the_light_left_out_is_stated_with_its_error():
 
 def test_the_fraction_that_moves_is_stated():
     extent = np.zeros((2, 10, 10))
-    extent[:, 0, :4], extent[:, 1, 0] = 2.0, 0.09
+    extent[:, 0, :4] = 2.0
+    extent[:, 1, 0] = 0.09
     found = moving(extent, 0.0)
     assert found.chosen == "4 % of the pixels move"
     assert "those by 2 on average" in found.size

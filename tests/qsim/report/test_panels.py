@@ -99,7 +99,8 @@ def test_a_code_of_several_frames_has_no_truth_of_its_own(tmp_path):
 def test_errors_are_red_above_and_blue_below():
     truth = np.full((1, 4, 6), 2.0)
     light = truth.copy()
-    light[0, 0, 0], light[0, 0, 1] = 9.0, 0.0
+    light[0, 0, 0] = 9.0
+    light[0, 0, 1] = 0.0
     shown = panels.error_panel("x", light, truth).frames
     assert np.array_equal(shown[0, 2, 2], [255, 255, 255])
     assert shown[0, 0, 0, 0] > 200 > 100 > shown[0, 0, 0, 2]

@@ -78,7 +78,9 @@ def test_numbers_of_64_bits_are_decided_from_either_end(seed):
     sensor = random_sensor(rng, 6, 1e3)
     photons = rng.uniform(0, 150, 60)
     first, second = rng.integers(0, 1 << 32, (2, 60), dtype=np.uint32)
-    first[:20], first[20:40] = 0, 0xFFFFFFFF  # tails
+    # tails
+    first[:20] = 0
+    first[20:40] = 0xFFFFFFFF
     expected = Sensor.codes_at(sensor, first, second, photons, EXPOSURE)
     np.testing.assert_array_equal(sensor.codes_at(first, second, photons, EXPOSURE), expected, err_msg=repr(sensor))
 

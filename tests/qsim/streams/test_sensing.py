@@ -151,7 +151,9 @@ def test_two_light_levels_share_their_random_numbers_and_another_seed_does_not(t
         wanted = Sensing("quiver-physical", 3, ppp, seed=seed)
         return sense(clip, wanted)[0].codes().astype(float).ravel()
 
-    low, high, other = noise(3.25), noise(4.0), noise(4.0, seed=1)
+    low = noise(3.25)
+    high = noise(4.0)
+    other = noise(4.0, seed=1)
     assert np.corrcoef(low, high)[0, 1] == pytest.approx(0.96, abs=0.01)
     assert abs(np.corrcoef(low, other)[0, 1]) < 5 / np.sqrt(light.size)
 

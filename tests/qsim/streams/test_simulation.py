@@ -141,7 +141,9 @@ def whole_and_crop(folder: Path, place: tuple[int, int]) -> tuple[Clip, Clip]:
 @pytest.mark.parametrize("kind", CROPPED)
 def test_a_crop_has_the_defects_and_the_noise_of_its_place(tmp_path, kind, place):
     """Under the same name and light the codes are those of the whole clip: stored, packed, replayed, drawn again."""
-    (whole, crop), (y, x), (sensor, how) = whole_and_crop(tmp_path, place), place, CROPPED[kind]
+    whole, crop = whole_and_crop(tmp_path, place)
+    y, x = place
+    sensor, how = CROPPED[kind]
     expected = sense(whole, Sensing(sensor, name="s", **how))[0]
     stream = sense(crop, Sensing(sensor, name="s", **how))[0]
     assert expected.origin == (0, 0)
@@ -158,7 +160,8 @@ def test_a_crop_has_the_defects_and_the_noise_of_its_place(tmp_path, kind, place
 @pytest.mark.parametrize("place", [(3, 4), (5, 6)])
 def test_the_compiled_engine_draws_a_crop_at_its_place(tmp_path, monkeypatch, place):
     monkeypatch.setattr("qsim.sensor.sensor.SMALLEST", 0)
-    (whole, crop), (y, x) = whole_and_crop(tmp_path, place), place
+    whole, crop = whole_and_crop(tmp_path, place)
+    y, x = place
     for how in ({}, {"defects": Defects(PATTERN)}):
         wanted = Sensing(BITS3, name="s", **how)
         reference = replace(prepare(whole, wanted), engine="reference").frames(whole, 0, 6)[:, y : y + 7, x : x + 9]

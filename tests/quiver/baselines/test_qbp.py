@@ -59,7 +59,8 @@ def test_search_is_exhaustive_and_stays_inside():
     patches = torch.from_numpy(rng.random((8, 8, 4)).astype(np.float32))
     found, cost = patch_alignment.search(patches, image, corner, centre, 2)
     for n in range(4):
-        (y, x), best = corner[:, n].tolist(), None
+        y, x = corner[:, n].tolist()
+        best = None
         start = [
             min(max(int(c), -a - 2), side - 8 - a + 2)
             for c, a, side in zip(centre[:, n], (y, x), (40, 48), strict=True)

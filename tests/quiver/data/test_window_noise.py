@@ -103,7 +103,8 @@ def test_sums_of_planes_have_the_distribution_of_their_pixels(make_clip: ClipMak
         x = data.place(n).x
         for kind in range(3):
             chosen = codes[..., (np.arange(x, x + 12) % 3) == kind]
-            sums[kind], counts[kind] = sums[kind] + chosen.sum(), counts[kind] + chosen.size
+            sums[kind] = sums[kind] + chosen.sum()
+            counts[kind] = counts[kind] + chosen.size
     sensor = Illumination.of(file, 5.0, 3).stated().draw(clip).sensor
     for kind, level in enumerate((5.0, 1.25, 0.0)):
         light = np.array([level])

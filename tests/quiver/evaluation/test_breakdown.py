@@ -48,7 +48,9 @@ def test_clips_are_pooled_by_their_pixels():
 
 def test_a_clip_with_flow_has_its_error_in_the_bin_of_its_motion(make_clip: ClipMaker, tmp_path):
     flow = np.zeros((2, 36, 44), np.float32)
-    flow[0], flow[1] = 1.2, -0.9  # 1.5 px/frame
+    # 1.5 px/frame
+    flow[0] = 1.2
+    flow[1] = -0.9
     clip = make_clip(flow=flow)
     comparison = Comparison(str(clip.path), split=None)
     methods = [restorer("moment:3")]

@@ -97,7 +97,8 @@ def test_scores_near_the_truth_are_marked(make_clip: ClipMaker):
         exact = sensed(clip, Illumination())[1].video()
         return method(f"at {psnr:g}", lambda codes: exact + rng.normal(0, sigma, exact.shape))
 
-    comparison, methods = Comparison(str(clip.path), None), [wrong(36.0), wrong(20.0)]
+    comparison = Comparison(str(clip.path), None)
+    methods = [wrong(36.0), wrong(20.0)]
     rows = evaluate(comparison, methods)
     assert rows[0].truth_psnr == pytest.approx(20 * math.log10(2.5 / 0.03), abs=0.01)
     near, far = summary.summarise(rows)

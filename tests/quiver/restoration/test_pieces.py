@@ -177,7 +177,8 @@ def test_threads_do_not_change_the_answer():
 def same_in_blocks(name: str, seed: int) -> None:
     """A random length, size, window and a bound down to a frame at a time: equal to 1e-5 of white."""
     rng = np.random.default_rng(seed)
-    frames, height, width = int(rng.integers(4, 8)), *(int(n) for n in rng.integers(8, 24, 2))
+    frames = int(rng.integers(4, 8))
+    height, width = (int(n) for n in rng.integers(8, 24, 2))
     codes = moving(frames, height, width, seed)
     asked = f"{name}:{rng.integers(1, 9)}"
     whole = restorer(asked).restore(codes)

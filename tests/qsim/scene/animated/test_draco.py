@@ -20,8 +20,8 @@ def compressed(seed: int = 0, **changes) -> tuple[Gltf, np.ndarray]:
     """A file with a compressed patch of waves, and the corners of its faces [F, 3, 3]."""
     rng = np.random.default_rng(seed)
     side = 9
-    y, x = np.mgrid[:side, :side] / (side - 1)
-    points = np.stack([x.ravel(), y.ravel(), 0.1 * rng.random(side * side)], axis=1).astype(np.float32)
+    places = np.mgrid[:side, :side] / (side - 1)
+    points = np.stack([places[1].ravel(), places[0].ravel(), 0.1 * rng.random(side * side)], axis=1).astype(np.float32)
     i = np.arange(side * side).reshape(side, side)
     a, b, c, d = (corner.ravel() for corner in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.uint32)

@@ -119,7 +119,8 @@ def compare(sensor: Sensor, rng: np.random.Generator, count: Count, monkeypatch:
     assert differ <= 3, (
         f"{differ} of {found.size} pixels differ, first at {where}, key {key}, origin {origin}: {sensor!r}"
     )
-    count.pixels, count.differ = count.pixels + found.size, count.differ + differ
+    count.pixels = count.pixels + found.size
+    count.differ = count.differ + differ
     if sensor.bits <= 8:
         count.few_bits += 1
         count.handed += plan_of(sensor, EXPOSURE) is None or sum(asked) > 4 * found.size  # packed: octets of 8

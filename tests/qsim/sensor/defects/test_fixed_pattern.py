@@ -160,7 +160,8 @@ def test_read_out_maps_draw_from_the_cdf_of_each_pixel():
     n = 200
     offset = np.zeros((n, 2 * n))
     noise = np.ones((n, 2 * n))
-    offset[:, n:], noise[:, n:] = 0.75, 3.0
+    offset[:, n:] = 0.75
+    noise[:, n:] = 3.0
     array = PixelArray(sensor, Maps(offset=offset, read_noise=noise))
     codes = array.sample(np.full((1, n, 2 * n), 3.0), EXPOSURE, key=KEY)
     for part, own in ((codes[..., :n], sensor), (codes[..., n:], replace(sensor, offset=0.75, read_noise=0.9))):
