@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from qsim import files, records
+from qsim.checks import file_path
 from qsim.parsing import unreadable
 
 FORMAT_VERSION = 1  # of clips, streams, data sets and restored videos; only this one is read
@@ -34,6 +35,17 @@ def write(path: Path, record: Any) -> str:
 def read(path: Path, kind: type[Made], cure: str) -> Made:
     """Return the record in a file; `ValueError` that ends with `cure` if it is damaged or of another version."""
     return of_values(path, files.read_json(path), kind, cure)
+
+
+def opened(path: str | Path, kind: type[Made], what: str, cure: str) -> tuple[Path, Made]:
+    """Return the array file NAME.npy that a description NAME.json describes, and its record; errors as of `read`.
+
+    `FileNotFoundError` if there is no such description of `what`.
+    """
+    description = file_path(path)
+    if not description.is_file():
+        raise FileNotFoundError(f"{description}: no such {what}")
+    return description.with_suffix(".npy"), read(description, kind, cure)
 
 
 def of_values(path: Path, found: dict[str, Any], kind: type[Made], cure: str) -> Made:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 from qsim.cli.command import Idle, command
-from qsim.cli.console import MAKES_AGAIN, bar, note, output, running
-from qsim.cli.sense import clips_of
+from qsim.cli.console import MAKES_AGAIN, output, running
+from qsim.cli.sense import clips_of, drawings
 from qsim.settings import setting
 from qsim.streams.event_sensing import EventSensing, sense_events
 
@@ -43,26 +43,15 @@ def events(asked: Events, wanted: tuple[EventSensing, ...]) -> int:
     clips = [clip for path in asked.paths for clip in clips_of(path)]
     made = []
     lines = []
-    frames = sum(len(clip) for clip in clips) * len(wanted)
-    before = 0
-    with bar("drawing events") as progress:
-        for clip in clips:
-            for sensing in wanted:
-                drawn: list[int] = []
-
-                def count(done: int, _: int, start: int = before, drawn: list[int] = drawn) -> None:
-                    drawn.append(done)
-                    progress(start + done, frames)
-
-                waiting = partial(note, f"{clip.path}: waiting for another process that draws events of this clip")
-                found, line = sense_events(clip, sensing, force=asked.force, progress=count, on_wait=waiting)
-                before += len(clip)
-                info = found.info
-                facts = {"clip": str(clip.path), "name": found.name, "file": str(found.path), "made": bool(drawn)}
-                facts |= {"events": info.events, "on": info.brighter, "following": info.following}
-                facts |= {"seconds": info.seconds, "shape": list(info.shape), "ppp": info.light.ppp, "light": line}
-                made.append(facts)
-                begun = "wrote" if drawn else "exists already:"
-                lines.append(f"{begun} {found.path}: {found.said}; {line}")
+    for clip, (found, line), drawn in drawings(
+        clips, wanted, partial(sense_events, force=asked.force), "drawing events"
+    ):
+        info = found.info
+        facts = {"clip": str(clip.path), "name": found.name, "file": str(found.path), "made": drawn}
+        facts |= {"events": info.events, "on": info.brighter, "following": info.following}
+        facts |= {"seconds": info.seconds, "shape": list(info.shape), "ppp": info.light.ppp, "light": line}
+        made.append(facts)
+        begun = "wrote" if drawn else "exists already:"
+        lines.append(f"{begun} {found.path}: {found.said}; {line}")
     output({"events": made}, lines)
     return 0

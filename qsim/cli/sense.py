@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -68,9 +68,25 @@ def sense(asked: Sense, wanted: Annotated[tuple[Sensing, ...], {"sensor": "quive
     if asked.replay:
         return _replay(asked, clips, wanted[0])
     made = []
+    for clip, (found, line), drawn in drawings(clips, wanted, partial(storing.sense, force=asked.force), "sensing"):
+        facts = {"clip": str(clip.path), "stream": found.name, "file": str(found.path), "made": drawn}
+        facts["light"] = line
+        facts["rates"] = found.rates
+        made.append(facts | _light(found.info))
+    if len(wanted) > 1:
+        note("streams of a clip with the same --seed share their random numbers: another --seed makes them independent")
+    lines = [_line(m) for m in made]
+    output({"streams": made}, lines)
+    return 0
+
+
+def drawings(
+    clips: Sequence[Any], wanted: Sequence[Any], draw: Callable[..., tuple[Any, str]], title: str
+) -> Iterator[tuple[Any, tuple[Any, str], bool]]:
+    """Draw what is missing of every clip by every setting, with a bar; yield (clip, what `draw` returns, drawn now)."""
     frames = sum(len(clip) for clip in clips) * len(wanted)
-    before = 0
-    with bar("sensing") as progress:
+    before: int = 0
+    with bar(title) as progress:
         for clip in clips:
             for sensing in wanted:
                 drawn: list[int] = []
@@ -79,18 +95,10 @@ def sense(asked: Sense, wanted: Annotated[tuple[Sensing, ...], {"sensor": "quive
                     drawn.append(done)
                     progress(start + done, frames)
 
-                waiting = partial(note, f"{clip.path}: waiting for another process that senses this clip")
-                found, line = storing.sense(clip, sensing, force=asked.force, progress=count, on_wait=waiting)
+                waiting = partial(note, f"{clip.path}: waiting for another process that works on this clip")
+                found = draw(clip, sensing, progress=count, on_wait=waiting)
                 before += len(clip)
-                facts = {"clip": str(clip.path), "stream": found.name, "file": str(found.path), "made": bool(drawn)}
-                facts["light"] = line
-                facts["rates"] = found.rates
-                made.append(facts | _light(found.info))
-    if len(wanted) > 1:
-        note("streams of a clip with the same --seed share their random numbers: another --seed makes them independent")
-    lines = [_line(m) for m in made]
-    output({"streams": made}, lines)
-    return 0
+                yield clip, found, bool(drawn)
 
 
 def _line(made: dict[str, Any]) -> str:

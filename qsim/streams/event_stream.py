@@ -19,7 +19,6 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import descriptions, files, opening, records
-from qsim.checks import file_path
 from qsim.files import VERSION, Progress
 from qsim.host import own_numbers
 from qsim.kinds import Count, Digest, Positive, Text, Whole
@@ -85,9 +84,7 @@ class EventStream:
     @staticmethod
     def open(json_path: str | Path) -> EventStream:
         """Open events; `FileNotFoundError` if they do not exist, `ValueError` if their description is damaged."""
-        if not (found := file_path(json_path)).is_file():
-            raise FileNotFoundError(f"{found}: no such events")
-        return EventStream(found.with_suffix(".npy"), descriptions.read(found, EventInfo, _DAMAGED))
+        return EventStream(*descriptions.opened(json_path, EventInfo, "events", _DAMAGED))
 
     def __len__(self) -> int:
         return self.info.events

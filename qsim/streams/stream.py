@@ -20,7 +20,6 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import colour, descriptions, files, locks, scratch
-from qsim.checks import file_path
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
 from qsim.files import VERSION, Progress
@@ -56,10 +55,7 @@ class Stream:
     @staticmethod
     def open(json_path: str | Path) -> Stream:
         """Open a stream; `FileNotFoundError` if it does not exist, `ValueError` if its description is damaged."""
-        if not (json_path := file_path(json_path)).is_file():
-            raise FileNotFoundError(f"{json_path}: no such stream")
-        info = descriptions.read(json_path, StreamInfo, _DAMAGED)
-        return Stream(json_path.with_suffix(".npy") if json_path.suffix == ".json" else json_path, info)
+        return Stream(*descriptions.opened(json_path, StreamInfo, "stream", _DAMAGED))
 
     def __len__(self) -> int:
         return self.info.shape[0]
