@@ -1,5 +1,5 @@
 # make demo    scenes -> few-bit frames -> restored video, as one page: out/demo/index.html
-# make test    the quick tests (about nine minutes on two cores of 2.6 GHz); make test-slow: the long ones
+# make test    the quick tests (ten minutes on two cores of 2.6 GHz, eighteen on one); make test-slow: the long ones
 # make lint    style and types; make docs: the manual into out/site
 # make reference    the parts of its pages that come from the code
 
