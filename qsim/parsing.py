@@ -1,4 +1,8 @@
-"""Parses TOML and JSON texts; errors name file and line, and deep nesting and huge numbers are refused."""
+"""Parses TOML and JSON texts; errors name file and line, and deep nesting and huge numbers are refused.
+
+These are checks that msgspec leaves out: it takes whole numbers of any size, ends at Python's own limit of nesting, and
+names no line. Records are made of the values by `records.convert`.
+"""
 
 from __future__ import annotations
 
