@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import result_page
 import torch
 from rows import (
     LIGHTS,
@@ -166,9 +167,9 @@ def write_table(out: Path) -> None:
         table.append([*cells, ", ".join(starred(row, row["seed"]) for row in own)])
     header = ("pre-denoiser", "flow", "multi-scale", "parameters", "steps", "PSNR matched", "SSIM matched", "seeds")
     steps = rows[0]["budget"].get("steps") if rows else None
+    length = f" --steps {steps}" if steps else ""
     text = [
-        *("# The paper's ablation with a million parameters", ""),
-        *(f"Made by `python benchmarks/ablation_rows.py out/starter{f' --steps {steps}' if steps else ''}`.", ""),
+        *result_page.head("The paper's ablation with a million parameters", f"ablation_rows.py out/starter{length}"),
         *(LIMITS, "", *markdown_table(table, header), "", *notes_on(rows)),
     ]
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import result_page
 from rows import (
     ROOT,
     Budget,
@@ -124,7 +125,7 @@ def write_page(out: Path) -> None:
     """Write OUT.md from the rows that exist."""
     rows = {path.stem: read_json(path) for path in sorted(out.glob("*.json"))}
     modes = rows.pop(MODES, None)
-    text = ["# What a restored frame costs", "", "Made by `python benchmarks/bench_rows.py`.", ""]
+    text = result_page.head("What a restored frame costs", "bench_rows.py")
     if rows:
         size = next(iter(rows.values()))["plan"]["size"]
         text += [f"## Frames of {size.replace('x', ' x ')} px", "", NOTES, *tiles_line(rows, size), ""]

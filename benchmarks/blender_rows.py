@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import result_page
 from numpy import ndarray as Array
 from rows import ROOT
 
@@ -26,10 +27,9 @@ from qsim.scene import read_gltf
 
 FRAME_RATE = 100.0  # of blender_scenes.py
 FRAMES = 3
-PAGE = """# Beside Blender
-
-*Written by `python benchmarks/blender_rows.py --page docs/results/blender.md`.*
-
+PAGE = (
+    "\n".join(result_page.head("Beside Blender", "blender_rows.py --page docs/results/blender.md"))
+    + """
 <!-- not run: needs Blender's bpy in a separate environment, and a quarter of an hour -->
 ```sh
 python3.11 -m venv out/bpy
@@ -49,6 +49,7 @@ Blender's own exporter writes each as `.glb`, and Cycles renders three frames of
 | scene | light [%] | structure [dB] | flow [px] | fastest [px] |
 |---|--:|--:|--:|--:|
 """
+)
 EDGE = 1  # px; the vector pass mixes surfaces in pixels on an outline
 
 

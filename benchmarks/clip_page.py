@@ -5,6 +5,7 @@ from __future__ import annotations
 from statistics import median
 from typing import Any
 
+import result_page
 from reuse_rows import MARK, how
 
 from qsim.tables import markdown_table
@@ -16,10 +17,13 @@ WAYS = {  # key in a row: its name on the page
     "alone": "frames alone",
     "shared": "frames that share",
 }
-HEAD = """# What frames of a clip cost
-
-*Written by `python benchmarks/clip_rows.py`, which says how. It makes missing rows, and marked ones again.*
-
+HEAD = (
+    "\n".join(
+        result_page.head(
+            "What frames of a clip cost", "clip_rows.py", ", which makes missing rows, and marked ones again"
+        )
+    )
+    + """
 <!-- not run: needs quiet cores for an hour or two -->
 ```sh
 python benchmarks/clip_rows.py
@@ -34,6 +38,7 @@ percentile, without a clamp. The naive loop takes the power of two of samples th
 or below the percentile. It is extrapolated from 64 samples. **times** is the time of the naive loop to white over the
 line's. Scenes have a speed at which the median moving pixel moves as stated.
 """
+)
 REFERENCES = """## The references
 
 **noise** is the noise of the mean of the converged pictures that frames are compared with, in dB below white.

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import result_page
 
 from qsim.dataset.dataset import Dataset
 from qsim.files import VERSION, write_json
@@ -30,14 +31,14 @@ ROWS = ROOT / "docs" / "results" / "colour.json"
 PAGE = ROOT / "docs" / "results" / "colour.md"
 METHODS = ("moment", "transform-denoise", "qbp-bm3d", "mergenet")
 CONTROL = "mergenet"
-HEAD = """# Networks on mosaics
-
-*Written by `python benchmarks/colour_rows.py --page`, which states the commands.*
-
+HEAD = (
+    "\n".join(result_page.head("Networks on mosaics", "colour_rows.py --page", ", which states the commands"))
+    + """
 {scenes} scenes of families that the training has not seen, {size}, behind an RGGB mask. `trained on mosaics` began with
 the weights of `mergenet` and learned {steps} steps of {batch} windows from {clips} clips ([Colour](../colour.md)). The
 others restore each colour alone, and linear filters join them. PSNR in dB after the best factor, over three bands.
 """
+)
 
 
 def rows_of(data: Path, run: Path) -> dict[str, Any]:

@@ -5,15 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import result_page
 from reuse_rows import MARK, how
 
 from qsim.tables import markdown_table
 
 TARGET = 5.0  # times faster than the cheapest setting of Cycles that reaches the error
-HEAD = """# Beside Blender's Cycles
-
-*Written by `python benchmarks/cycles_rows.py`, which says how. It makes missing rows, and marked ones again.*
-
+HEAD = (
+    "\n".join(
+        result_page.head(
+            "Beside Blender's Cycles", "cycles_rows.py", ", which makes missing rows, and marked ones again"
+        )
+    )
+    + """
 <!-- not run: needs Blender's bpy in a separate environment, and an hour or two -->
 ```sh
 python3.11 -m venv out/bpy
@@ -32,6 +36,7 @@ Each program is judged by its own converged pictures. **reached** is in dB below
 over several frames. Ours takes a budget that asks for 40 dB. Ours and one setting of Cycles are rendered in turn. **s**
 is the median over all frames but the first, in which both programs load, in {clock}.
 """
+)
 CONVERGED = """## Do both programs compute the same light?
 
 Converged pictures of both, compared before any time is measured. **at least** is the agreement without the noise of

@@ -26,6 +26,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import result_page
 from rows import (
     LIGHTS,
     TINY,
@@ -231,7 +232,7 @@ def write_tables(out: Path) -> None:
     classical = next((row for row in rows if row["kind"] == "classical"), {"scores": {}})
     known: dict[str, Any] = classical["scores"]
     floor = mean_of(known[FLOOR][at]) if FLOOR in known else -math.inf
-    text = ["# Every network after the same time", "", "Made by `python benchmarks/equal_budget.py out/starter`.", ""]
+    text = result_page.head("Every network after the same time", "equal_budget.py out/starter")
     text += [LIMITS, ""]
     text += [f"![Validation PSNR over minutes of training]({out.name}.png)", ""]
     text += [f"## About one million multiply-adds per pixel and frame, {at}", ""]

@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import result_page
 from equal_budget import APART, FLOOR, HEADER, RECORD, ROWS, classical, learned, mean_of, score_cells
 from rows import LIGHTS, TINY, check_row, keep_apart, missing_rows, notes_on, options, scores
 from step_rows import Steps, refuse_busy, together
@@ -87,10 +88,10 @@ def write_table(out: Path) -> None:
         lines.append((mean_of(found), cells))
     header = (*HEADER[:4], *("parameters", "rate", "last validation [dB]"), *HEADER[8:-3])
     budget = rows[0]["budget"] if rows else {"steps": 0, "batch": 0}
-    command = f"python benchmarks/equal_steps.py out/starter --steps {budget['steps']}"
+    command = f"equal_steps.py out/starter --steps {budget['steps']}"
+    windows = f": steps of {budget['batch']} windows"
     text = [
-        *("# Every network after the same steps", ""),
-        *(f"Made by `{command}`: steps of {budget['batch']} windows.", ""),
+        *result_page.head("Every network after the same steps", command, windows),
         *(LIMITS, "", f"## Published widths, {AT}", ""),
         *markdown_table([cells for _, cells in sorted(lines, key=lambda line: -line[0])], header),
         *("", *missing_rows(NAMES, rows), *notes_on(rows)),

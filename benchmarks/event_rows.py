@@ -9,13 +9,13 @@ frames. An event is matched with that of the same number in the same pixel and o
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import result_page
 from numpy import ndarray as Array
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
@@ -23,7 +23,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 import event_loop
 from clips import sliding_pattern
 
-from qsim.files import write_bytes
 from qsim.keys import Key
 from qsim.sensor.event_camera import CAMERAS, EventCamera, load
 from qsim.sensor.event_pixels import EventPixels
@@ -117,10 +116,7 @@ def page() -> str:
     flicker = [[f"{cycles:g}", *compared(lamp(cycles))] for cycles in FLICKERS]
     errors = ("times off by, median [us]", "95 % within [us]")
     lines = [
-        "# Event cameras: speed and range",
-        "",
-        "*Written by `python benchmarks/event_rows.py --page docs/results/events.md`.*",
-        "",
+        *result_page.head("Event cameras: speed and range", "event_rows.py --page docs/results/events.md"),
         "One thread of one core. The plain loop takes pixel by pixel and event by event, and gives the same events.",
         "",
         *markdown_table(
@@ -140,17 +136,5 @@ def page() -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Print the page, or write it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--page", type=Path, help="file to write")
-    asked = parser.parse_args()
-    text = page()
-    if asked.page is None:
-        print(text)
-    else:
-        write_bytes(asked.page, text.encode())
-
-
 if __name__ == "__main__":
-    main()
+    result_page.main(__doc__, page)

@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import result_page
 
 from qsim import descriptions, keys, records
 from qsim.clip.clip_info import PHYSICAL
@@ -77,10 +78,9 @@ COUNTS = {
     "entries of the fullest folder": "fullest_folder",
     "size of dataset.json [bytes]": "dataset_json",
 }
-HEAD = """# A million clips
-
-*Written by `python benchmarks/million_clips.py --page`.*
-
+HEAD = (
+    "\n".join(result_page.head("A million clips", "million_clips.py --page"))
+    + """
 A recipe with `seeds = "0..999999"` begins as fast as one with a single seed. Clips are counted from the recipe, files
 lie in blocks of a thousand clips ([data sets](datasets.md)), and training opens a clip when it draws from it. This page
 says what the bookkeeping costs, and what the clips cost.
@@ -91,6 +91,7 @@ Tiny clips of 3 frames of 8 x 8 px stand in for rendered ones. `one shard` and `
 `resume` and `publish` of a part of a thousand. Each ran in a process of its own, without the time of imports, on two
 cores that other programs shared.
 """
+)
 TESTED = 10  # clips, the last ones of the recipe
 PART = 1000  # clips of one part of `check`, `resume` and `publish`
 

@@ -27,6 +27,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+import result_page
 from numpy import ndarray as Array
 from rows import grow, keep_apart
 
@@ -196,9 +197,8 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
             )
         )
     text = [
-        "# Codes that sum planes",
-        "",
-        "Made by `python benchmarks/planes_rows.py`, which says how. Processor seconds of a sharp frame, and of a code",
+        *result_page.head("Codes that sum planes", "planes_rows.py"),
+        "Processor seconds of a sharp frame, and of a code",
         "with its sharp frame in the middle, ground truth of all frames and storing included. Both have the same asked",
         "PSNR. Samples are per pixel and frame. Errors are those of the light of a frame and of a code, in dB below",
         "white; a code states the larger of the errors of its light and of its sharp frame.",

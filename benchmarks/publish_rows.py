@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+import result_page
 
 import quiver
 from qsim.dataset.dataset import Dataset
@@ -131,16 +132,16 @@ def measured(source: Path, folder: Path) -> dict[str, Any]:
     return {"clips": len(clips), "shape": list(shape), "memory": peak_memory(), "rows": rows}
 
 
-HEAD = """# Published sets
-
-*Written by `python benchmarks/publish_rows.py --page`.*
-
+HEAD = (
+    "\n".join(result_page.head("Published sets", "publish_rows.py --page"))
+    + """
 [`qsim publish`](../publish.md) wrote a rendered data set of {clips} clips of {frames} frames of {height} x {width} px,
 with one stream of 3 bits, in every format. `windows` are those of `quiver.windows`: 11 frames of {crop} x {crop} px per
 second, drawn by one process, with noise. `in order` are the frames of radiance per second that the library of the
 format reads, one clip after the other.
 
 """
+)
 TAIL = """
 - The data set stores no `truth` in photons, and its ground truth lies in one zipped file per frame. Published sets hold
   `truth` in float32, not compressed, and each channel of ground truth is compressed alone.

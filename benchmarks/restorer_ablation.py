@@ -23,6 +23,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+import result_page
 import torch
 from numpy import ndarray as Array
 from rows import keep_apart
@@ -317,8 +318,8 @@ def write_table(out: Path) -> None:
             table.append((variant.text, " / ".join(f"{row['psnr']:.2f}" for row in runs), *told))
     size = rows[0]["size"]
     levels = [f"{key} PPP" for key in rows[0]["by_light"]]
-    text = ["# What each idea of mergenet brings", ""]
-    text += ["Made by `python benchmarks/restorer_ablation.py out/photos out/restorer out/restorer_test`.", ""]
+    command = "restorer_ablation.py out/photos out/restorer out/restorer_test"
+    text = result_page.head("What each idea of mergenet brings", command)
     text += [
         f"{size['steps']} steps of {size['batch']} windows of {size['crop']} x {size['crop']} px from "
         f"{size['windows']} windows. Mean PSNR in dB on windows of the test clips, peak 2.5 times the mean light, "

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import result_page
 from numpy import ndarray as Array
 
 from qsim.figures import new_figure, write_figure
@@ -133,7 +134,7 @@ def page(found: Array, scenes: int, size: int, weights: str) -> str:
     """Return the page of all numbers."""
     best = np.take(BITS, found.argmax(-1))
     three = BITS.index(3)
-    text = ["# The best bit depth with the default restorer", "", "Made by `python benchmarks/restorer_bits.py`.", ""]
+    text = result_page.head("The best bit depth with the default restorer", "restorer_bits.py")
     text += [
         f"Mean over {scenes} scenes of {size} x {size} px in which photographs slide before one another; "
         f"weights {weights[:12]}. PSNR is matched, peak 2.5 times the mean light. Light is counted in photons per "

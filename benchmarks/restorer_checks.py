@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import result_page
 from numpy import ndarray as Array
 from PIL import Image, ImageDraw
 
@@ -132,12 +133,9 @@ def captioned(picture: Array, text: str) -> Array:
 
 def page(found: dict[str, Any]) -> str:
     """Return the page of what was measured."""
-    text = [
-        "# The restorer: shifts, real photons, crops",
-        "",
-        "Made by `python benchmarks/restorer_checks.py out/restorer_test COUNTS.npy`.",
-        "",
-    ]
+    text = result_page.head(
+        "The restorer: shifts, real photons, crops", "restorer_checks.py out/restorer_test COUNTS.npy"
+    )
     text += [f"Weights {found['weights'][:12]}.", "", "## A shift by one pixel", ""]
     text += [
         "The rms difference between a shifted result and the result of shifted codes, over the rms error that is "

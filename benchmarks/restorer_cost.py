@@ -18,6 +18,7 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
+import result_page
 import rows
 from skimage import data
 
@@ -171,7 +172,7 @@ def page(found: dict[str, list[tuple[float, float]]], memory: int, size: str, bu
         )
         for name, runs in found.items()
     ]
-    text = ["# What the restorer costs", "", "Made by `python benchmarks/restorer_cost.py`.", ""]
+    text = result_page.head("What the restorer costs", "restorer_cost.py")
     text += [f"Seconds per frame of {size}, eleven frames at 3 bits and 3.25 PPP, both programs in turn.", ""]
     text += [*markdown_table(table, ("program", "median [s]", "runs [s]", "most memory of the process")), ""]
     text += [

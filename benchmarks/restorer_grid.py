@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import result_page
 
 from qsim.figures import new_figure, write_figure
 from qsim.files import VERSION, read_json, write_bytes, write_json
@@ -173,11 +174,9 @@ def write_tables(out: Path, names: Sequence[str], clips: Sequence[str]) -> None:
     rows = [(cell["name"], *compared(cell)) for cell in cells]
     gains = [own - rival for _, own, _, rival, _ in rows]
     lost = [name for (name, *_), gain in zip(rows, gains, strict=True) if gain < 0]
-    text = ["# The restorer against every classical method", ""]
-    text += [
-        "Made by `python benchmarks/restorer_grid.py out/restorer_test` on the clips of `scenes/restorer_test.toml`.",
-        "",
-    ]
+    title = "The restorer against every classical method"
+    clips_of = " on the clips of `scenes/restorer_test.toml`"
+    text = result_page.head(title, "restorer_grid.py out/restorer_test", clips_of)
     text += [
         f"Matched PSNR in dB, peak 2.5 times the mean light, mean over {len(clips)} clips, "
         f"{cells[0]['frames']} frames of each. Weights: {cells[0]['weights'][:12]}.",

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import result_page
 from numpy import ndarray as Array
 from restorer_bits import EDGE, scene
 
@@ -256,7 +257,7 @@ def told(values: Sequence[float], digits: int) -> str:
 
 def page(found: dict[str, Any]) -> str:
     """Return the page of what was measured."""
-    text = ["# The restorer outside of its grid", "", "Made by `python benchmarks/restorer_limits.py`.", ""]
+    text = result_page.head("The restorer outside of its grid", "restorer_limits.py")
     text += [
         f"Weights {found['weights'][:12]}, {found['draws']} draws of {found['size']} x {found['size']} px and "
         f"{FRAMES} frames; mean and standard error. The frame in the middle is scored, {EDGE} px from its edges. "

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import result_page
 from restorer_grid import FRAMES, Place, measured, places
 from rows import keep_apart
 
@@ -131,11 +132,8 @@ def write_table(out: Path) -> None:
         spread = f"{gain.min():+.2f} to {gain.max():+.2f}"
         table.append((row["name"], f"{shipped.mean():.2f}", f"{tuned.mean():.2f}", f"{gain.mean():+.2f}", spread))
     size = rows[0]["size"]
-    text = ["# The restorer beside weights for one cell", ""]
-    text += [
-        "Made by `python benchmarks/restorer_tuned.py out/photos out/restorer out/restorer_val out/restorer_test`.",
-        "",
-    ]
+    command = "restorer_tuned.py out/photos out/restorer out/restorer_val out/restorer_test"
+    text = result_page.head("The restorer beside weights for one cell", command)
     text += [
         f"{size['steps']} steps from the shipped weights with windows of one cell alone. Mean matched PSNR in dB "
         f"over {len(rows[0]['clips'])} test clips, {size['frames']} frames of each.",

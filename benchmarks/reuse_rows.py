@@ -28,6 +28,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+import result_page
 from numpy import ndarray as Array
 from rows import grow, keep_apart
 
@@ -199,9 +200,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
             )
         )
     text = [
-        "# Frames that share samples",
-        "",
-        "Made by `python benchmarks/reuse_rows.py`, which says how; rows that end in -s307 with `--seed 307`.",
+        *result_page.head("Frames that share samples", "reuse_rows.py", "; rows that end in -s307 with `--seed 307`"),
         "Processor seconds per frame at equal asked PSNR, frames alone and with neighbours; decibels below white.",
         "A frame states the error that clip.json has.",
         "`stated - reached` is the mean over the judged frames of a clip, `at most` the worst frame. `flicker` is the",

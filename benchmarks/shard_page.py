@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import result_page
 from shard_contents import EDGES, FITTED, LOOKED_AT, MOTION, RINGS
 
 from qsim.clip.motion_statistics import MOVING
@@ -18,10 +19,15 @@ SHARE = 1 / 3  # wanted processor hours with reuse, of those without
 WITHIN = (0.7, 1.3)  # wanted processor hours used, of those planned
 MOST_MEMORY = 2.5  # GB of a worker
 
-HEAD = """# A shard of {recipe}: planned, made and measured
-
-*Written by `python benchmarks/shard_cost.py`. The json file beside this page holds all numbers.*
-
+HEAD = (
+    "\n".join(
+        result_page.head(
+            "A shard of {recipe}: planned, made and measured",
+            "shard_cost.py",
+            ", which keeps all numbers in the json file beside this page",
+        )
+    )
+    + """
 `scenes/{recipe}.toml` has {clips} clips. The other recipe below differs from it in one line, `reuse = false`. Shard
 {part} has the clips {names}.
 
@@ -40,6 +46,7 @@ python benchmarks/shard_cost.py --shard {part} --alone out/plan_alone.json --reu
 The times are estimates. Hours are of processor time, of all threads, unless they are called wall hours. 1 GB is 10⁹
 bytes. A clip that is made on the machine of its plan finds the kernels that the plan compiled.
 """
+)
 MISSING = "not measured yet"
 
 

@@ -11,16 +11,15 @@ times the mean light, at most its largest value.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import result_page
 from numpy import ndarray as Array
 
 from qsim.dataset.scene_rendering import render
-from qsim.files import write_bytes
 from qsim.formats.between_frames import Between, estimator
 from qsim.tables import markdown_table
 
@@ -79,10 +78,7 @@ def compared(light: Array, step: int) -> list[str]:
 def page(data: Path | None) -> str:
     """Return the page of the table."""
     lines = [
-        "# Frames between frames",
-        "",
-        "*Written by `python benchmarks/video_rows.py --page docs/results/video.md --data FOLDER`.*",
-        "",
+        *result_page.head("Frames between frames", "video_rows.py --page docs/results/video.md --data FOLDER"),
         f"Every N-th frame is taken; those between are estimated ({estimator()}), blended, or repeated.",
         f"Families are rendered without blur at 2000 frames per second, {SIDE} x {SIDE} px, to {ERROR:g} dB.",
         "Pixels between frames are the 90th percentile of the true flow.",
@@ -96,18 +92,5 @@ def page(data: Path | None) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Print the page, or write it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--page", type=Path, help="file to write")
-    parser.add_argument("--data", type=Path, help="folder of the real recordings")
-    asked = parser.parse_args()
-    text = page(asked.data)
-    if asked.page is None:
-        print(text)
-    else:
-        write_bytes(asked.page, text.encode())
-
-
 if __name__ == "__main__":
-    main()
+    result_page.main(__doc__, page, data="folder of the real recordings")
