@@ -200,6 +200,12 @@ def test_impossible_radiance_is_named_and_leaves_nothing(tmp_path: Path, value: 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_number_that_no_reader_takes_is_refused_before_the_first_frame(tmp_path: Path):
+    with pytest.raises(ValueError, match="more than 64 bits"):
+        ClipWriter(tmp_path / "a", meta() | {"scene": {"kind": "Scene", "seed": 2**255}})
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_missing_frame_is_not_a_clip(tmp_path: Path):
     writer = ClipWriter(tmp_path / "a", meta()).__enter__()
     for t in (0, 1, 2, 4):
