@@ -27,8 +27,21 @@ def flag(name: str, value: object) -> None:
         raise ValueError(f"{name} must be true or false, got {shown(value)}")
 
 
+class NetworkConfig:
+    """The configuration of a network, a record whose fields a file of weights holds as JSON."""
+
+    def to_dict(self) -> dict[str, object]:
+        """Return plain values for JSON."""
+        return asdict(self)  # type: ignore[call-overload]
+
+    @classmethod
+    def from_dict(cls, values: dict[str, object]) -> Self:
+        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
+        return convert(values, cls, cls.__name__.removesuffix("Config") or "QUIVER")
+
+
 @dataclass(frozen=True)
-class Config:
+class Config(NetworkConfig):
     """Configuration of a QUIVER network; the defaults are the published design at full width."""
 
     channels: int = 64  # the unit C of all widths
@@ -59,12 +72,3 @@ class Config:
                 f"Config.channels must be even and a multiple of the {self.deformable_groups} deformable groups, "
                 f"got {self.channels}"
             )
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> Self:
-        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return convert(values, cls, "QUIVER")

@@ -13,22 +13,21 @@ hardly changes the answer. Joins add instead of concatenating, which saves a thi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from qsim.records import convert
 from quiver.model.blocks import conv
-from quiver.model.config import whole_number
+from quiver.model.config import NetworkConfig, whole_number
 
 INPUTS = 13  # channels, of quiver/restoration/merge_inputs.py
 
 
 @dataclass(frozen=True)
-class MergeNetConfig:
+class MergeNetConfig(NetworkConfig):
     """Configuration: three scales with widths w, 2w, 4w; w = 40 gives 0.91 million parameters."""
 
     width: int = 40
@@ -40,15 +39,6 @@ class MergeNetConfig:
             raise ValueError(
                 f"MergeNetConfig.inputs is {self.inputs!r}, this version prepares {INPUTS}; train such weights again"
             )
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> MergeNetConfig:
-        """Return the configuration of such values; ValueError for any others."""
-        return convert(values, cls, "MergeNet")
 
 
 class MergeNet(nn.Module):

@@ -12,23 +12,22 @@ untrained end returns the linear estimate.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any, Self
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from qsim.checks import shown
-from qsim.records import convert
 from quiver.model.blocks import conv
-from quiver.model.config import whole_number
+from quiver.model.config import NetworkConfig, whole_number
 
 DARK = 0.02  # of the mean light: the floor of the unit of a correction
 LONGEST_SIDE = 16  # px, of a tile
 
 
 @dataclass(frozen=True)
-class MosaicNetConfig:
+class MosaicNetConfig(NetworkConfig):
     """Configuration: the network of one band, the mask that the end has learned, and the end's size."""
 
     core: str  # the class of a network
@@ -48,15 +47,6 @@ class MosaicNetConfig:
     def tile(self) -> tuple[int, int]:
         """Rows and columns of the tile."""
         return len(self.mask), len(self.mask[0])
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> Self:
-        """Return the configuration of such values; ValueError for any others."""
-        return convert(values, cls, "MosaicNet")
 
 
 class MosaicNet(nn.Module):

@@ -5,7 +5,7 @@ the compared networks (quiver/model/rivals/). Look-ahead: 5 frames; beyond the e
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar
 
@@ -13,29 +13,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.records import convert
 from quiver.model.blocks import RADIUS, WINDOW, check_input, conv, join
-from quiver.model.config import whole_number
+from quiver.model.config import NetworkConfig, whole_number
 from quiver.model.rivals.edges import restored_range
 
 
 @dataclass(frozen=True)
-class UNetConfig:
+class UNetConfig(NetworkConfig):
     """Configuration of a U-Net: three scales with widths w, 2w, 4w; w = 32 gives 0.91 million parameters."""
 
     width: int = 32
 
     def __post_init__(self) -> None:
         whole_number("UNetConfig.width", self.width, 1, 1024)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> "UNetConfig":
-        """Return the configuration of such values; ValueError for anything but a width."""
-        return convert(values, cls, "UNet")
 
 
 class SmallUNet(nn.Module):

@@ -20,15 +20,14 @@ Our reading: means of the photon law are over the voxels that count; the publish
 """
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from typing import ClassVar, NamedTuple, Self
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.records import convert
-from quiver.model.config import flag, real_number, whole_number
+from quiver.model.config import NetworkConfig, flag, real_number, whole_number
 from quiver.model.rivals.edges import check_frames, pad_space, reflected
 
 LEVELS = 4
@@ -40,7 +39,7 @@ LEAST_SHARE = 1e-6  # of the photons in the input; the largest is 1 minus this
 
 
 @dataclass(frozen=True)
-class Bit2BitConfig:
+class Bit2BitConfig(NetworkConfig):
     """Configuration of bit2bit; the defaults are the published sizes with the binomial law."""
 
     width: int = 24  # channels at full size, a multiple of 4; twice, four and eight times as many below
@@ -56,15 +55,6 @@ class Bit2BitConfig:
         whole_number("Bit2BitConfig.planes", self.planes, 1, 2**16 - 1)
         real_number("Bit2BitConfig.dark", self.dark, 0, 1e3)
         flag("Bit2BitConfig.as_published", self.as_published)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> Self:
-        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return convert(values, cls, "bit2bit")
 
 
 class Split(NamedTuple):

@@ -12,15 +12,14 @@ the network the noise of a 12-bit camera, about a thousandth of the true one. To
 not clipped; a slip in one colour coefficient is mended too. `as_published` brings all three back.
 """
 
-from dataclasses import asdict, dataclass
-from typing import ClassVar, NamedTuple, Self
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.records import convert
-from quiver.model.config import flag, whole_number
+from quiver.model.config import NetworkConfig, flag, whole_number
 from quiver.model.rivals.edges import check_frames, pad_space
 from quiver.model.rivals.noise import numbers, table_of, variance_at
 
@@ -30,7 +29,7 @@ SCALES = 3
 
 
 @dataclass(frozen=True)
-class EMVDConfig:
+class EMVDConfig(NetworkConfig):
     """Configuration of EMVD; the defaults are the published sizes, and the noise that the sensor has."""
 
     width: int = 16  # hidden channels of the small networks
@@ -45,15 +44,6 @@ class EMVDConfig:
             flag(f"EMVDConfig.{name}", getattr(self, name))
         published = numbers("EMVDConfig.published_noise", self.published_noise, 2, 2)
         object.__setattr__(self, "published_noise", published)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> Self:
-        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return convert(values, cls, "EMVD")
 
 
 class Fused(NamedTuple):

@@ -13,14 +13,13 @@ for each frame, we have 15/16 of the width. In training, batch normalisation see
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from qsim.records import convert
-from quiver.model.config import flag, whole_number
+from quiver.model.config import NetworkConfig, flag, whole_number
 from quiver.model.rivals.edges import restored_range
 from quiver.model.rivals.noise import deviation_map, table_of
 
@@ -28,7 +27,7 @@ TRIPLE = 3  # frames of a U-Net
 
 
 @dataclass(frozen=True)
-class FastDVDnetConfig:
+class FastDVDnetConfig(NetworkConfig):
     """Configuration of FastDVDnet; the defaults are the published sizes, with noise maps of the sensor."""
 
     width: int = 32  # channels at full size; twice and four times as many at half and at a quarter
@@ -40,15 +39,6 @@ class FastDVDnetConfig:
         whole_number("FastDVDnetConfig.width", self.width, 2, 1024)
         for name in ("noise_map", "batch_norm"):
             flag(f"FastDVDnetConfig.{name}", getattr(self, name))
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> Self:
-        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return convert(values, cls, "FastDVDnet")
 
 
 class FastDVDnet(nn.Module):

@@ -22,17 +22,16 @@ Our reading:
 """
 
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.records import convert
 from quiver.model.blocks import FlowNetwork
-from quiver.model.config import FLOW_LAYERS, flag, real_number, whole_number
+from quiver.model.config import FLOW_LAYERS, NetworkConfig, flag, real_number, whole_number
 from quiver.model.deformable import warp
 from quiver.model.ops.splatting import average_splat
 from quiver.model.rivals.edges import check_frames, pad_space, reflected
@@ -43,7 +42,7 @@ VALID = 0.9999  # least part of a warped pixel that must come from inside
 
 
 @dataclass(frozen=True)
-class FloRNNConfig:
+class FloRNNConfig(NetworkConfig):
     """Configuration of FloRNN; the defaults are the published sizes, with a flow network and the sensor's noise."""
 
     width: int = 64  # channels of a state
@@ -74,15 +73,6 @@ class FloRNNConfig:
             whole_number("FloRNNConfig.flow_channels", channels, 1, 1024)
         object.__setattr__(self, "flow_channels", tuple(self.flow_channels))
         flag("FloRNNConfig.as_published", self.as_published)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> Self:
-        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return convert(values, cls, "FloRNN")
 
 
 class Flows(NamedTuple):

@@ -20,16 +20,15 @@ not fit single frames afterwards. We normalise groups of channels of each frame 
 """
 
 import math
-from dataclasses import asdict, dataclass
-from typing import ClassVar, NamedTuple, Self
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.records import convert
 from quiver.model.blocks import conv, join, resize, upsample
-from quiver.model.config import flag, whole_number
+from quiver.model.config import NetworkConfig, flag, whole_number
 from quiver.model.rivals.edges import check_frames, pad_space
 
 IMAGE = 3  # channels of an image
@@ -44,7 +43,7 @@ SLOPE = 0.1  # of every LeakyReLU
 
 
 @dataclass(frozen=True)
-class MemDeblurConfig:
+class MemDeblurConfig(NetworkConfig):
     """Configuration of MemDeblur; the defaults are the published sizes."""
 
     width: int = 64  # hidden channels; all other sizes but the 48 features of a frame scale with it
@@ -62,15 +61,6 @@ class MemDeblurConfig:
             whole_number(f"MemDeblurConfig.{name}", getattr(self, name), 0, 1024)
         for name in ("group_norm", "as_published"):
             flag(f"MemDeblurConfig.{name}", getattr(self, name))
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> Self:
-        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return convert(values, cls, "MemDeblur")
 
 
 class Clip(NamedTuple):

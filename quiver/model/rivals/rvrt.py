@@ -15,16 +15,15 @@ The transformer stacks have shifted windows in space, and all frames of a clip i
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import ClassVar, NamedTuple, Self
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.records import convert
-from quiver.model.config import whole_number
+from quiver.model.config import NetworkConfig, whole_number
 from quiver.model.deformable import warp
 from quiver.model.ops.deformable_attention import deformable_attention
 from quiver.model.rivals.edges import check_frames, pad_space, reflected
@@ -47,7 +46,7 @@ OTHER_REGION = -100.0  # added to the logits of pixels that are neighbours only 
 
 
 @dataclass(frozen=True)
-class RVRTConfig:
+class RVRTConfig(NetworkConfig):
     """Configuration of RVRT; the defaults are the published sizes."""
 
     width: int = 144  # channels, a multiple of 6
@@ -62,15 +61,6 @@ class RVRTConfig:
                 f"choose {self.width // HEADS * HEADS}"
             )
         whole_number("RVRTConfig.flow_levels", self.flow_levels, 1, 6)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> Self:
-        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return convert(values, cls, "RVRT")
 
 
 class Guides(NamedTuple):

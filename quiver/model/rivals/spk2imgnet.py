@@ -15,15 +15,14 @@ the clip is then the restored frame, and the factor is left out. Where the port 
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import ClassVar, NamedTuple, Self
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.records import convert
-from quiver.model.config import flag, whole_number
+from quiver.model.config import NetworkConfig, flag, whole_number
 from quiver.model.deformable import deform_conv2d
 from quiver.model.rivals.edges import restored_range
 
@@ -36,7 +35,7 @@ CONVERTER = 0.6  # what the network gives for a target of 1
 
 
 @dataclass(frozen=True)
-class Spk2ImgNetConfig:
+class Spk2ImgNetConfig(NetworkConfig):
     """Configuration of Spk2ImgNet; the defaults are the published sizes with the factor that the port forgot."""
 
     width: int = 64  # channels of the features
@@ -57,15 +56,6 @@ class Spk2ImgNetConfig:
                 f"Spk2ImgNetConfig.as_published needs groups of 2 frames, got {self.group_frames}; "
                 "leave one of the two settings out"
             )
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> Self:
-        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return convert(values, cls, "Spk2ImgNet")
 
 
 class Extracted(NamedTuple):

@@ -14,23 +14,22 @@ Look-ahead: 5 frames. Beyond the ends of a clip, time runs backwards.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import ClassVar, NamedTuple, Self
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.records import convert
 from quiver.model.blocks import RADIUS, WINDOW, conv
-from quiver.model.config import flag, whole_number
+from quiver.model.config import NetworkConfig, flag, whole_number
 from quiver.model.rivals.edges import restored_range
 
 LEAST_VARIANCE = 1e-6  # of a channel of features, so that constant ones have a slope
 
 
 @dataclass(frozen=True)
-class StudentTeacherConfig:
+class StudentTeacherConfig(NetworkConfig):
     """Configuration of Student-Teacher; the defaults are the sizes of our specification."""
 
     width: int = 64  # channels
@@ -42,15 +41,6 @@ class StudentTeacherConfig:
         whole_number("StudentTeacherConfig.width", self.width, 1, 1024)
         whole_number("StudentTeacherConfig.blocks", self.blocks, 0, 100)
         flag("StudentTeacherConfig.distil", self.distil)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> Self:
-        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
-        return convert(values, cls, "Student-Teacher")
 
 
 class Features(NamedTuple):
