@@ -202,7 +202,7 @@ def test_impossible_radiance_is_named_and_leaves_nothing(tmp_path: Path, value: 
 
 def test_a_number_that_no_reader_takes_is_refused_before_the_first_frame(tmp_path: Path):
     with pytest.raises(ValueError, match="more than 64 bits"):
-        ClipWriter(tmp_path / "a", meta() | {"scene": {"family": "fan", "seed": 2**255, "speed": 1.0}})
+        ClipWriter(tmp_path / "a", meta() | {"source": {"format": "zarr", "attributes": {"fps": 2**255}}})
     assert list(tmp_path.iterdir()) == []
 
 
