@@ -134,6 +134,7 @@ def measure(
             raise ValueError(f"{name}: frame {frames} is {values.shape[1:]}, the frames before are {previous.shape}")
         else:
             sums["lagged"] += previous * values[0]
+        # Sums, squares, and products with the next frame, the next row and the next column
         sums["total"] += values.sum(axis=0)
         sums["square"] += np.einsum("tyx,tyx->yx", values, values)
         sums["lagged"] += np.einsum("tyx,tyx->yx", values[1:], values[:-1])

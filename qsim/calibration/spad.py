@@ -286,6 +286,7 @@ def _mean_rate(array: _Array, dark: DarkRates, chosen: Array) -> Value:
     far = chosen & ~near
     mean = max(stack.mean for stack in array.darks)
     square = array.common(mean) * float(dark.variance[far].sum())
+    # Squares of the errors of the sum: pixels far from saturation scatter alike on both sides, those near it do not
     below, above = _near_saturation(dark, near, array.response)
     n = float(chosen.sum())
 
@@ -370,6 +371,7 @@ def _efficiency(array: _Array) -> tuple[dict[str, Value], list[str]]:
         return np.array([_mean_light(flat, dark, good, response)[0] for flat in used]) / photons
 
     base = slopes(array.response)
+    # Errors of the flats: each has its own counts, and all share the dark rates and the dead time
     covariance = np.diag([_mean_light(flat, array.dark, good, array.response)[1] for flat in used])
     covariance *= array.common(max(flat.mean for flat in used))
     if array.dark is not None:
@@ -382,6 +384,7 @@ def _efficiency(array: _Array) -> tuple[dict[str, Value], list[str]]:
         ends = [slopes(replace(array.response, ratio=ratio)) for ratio in array.ratio.ends]
         moved = (ends[1] - ends[0]) / (2 * Z95)
     errors = covariance + np.outer(moved, moved)
+    # The mean of the least variance of numbers with joint errors (Gauss and Markov)
     weights = np.linalg.solve(errors, np.ones(len(used)))
     weights /= weights.sum()
     value = float(weights @ base)

@@ -139,6 +139,7 @@ def electron_peaks(cells: Sequence[Cell], gain: float) -> list[Peaks]:
     inner = size_of[first:last]
     if len(inner) < 3:
         return []
+    # A peak is a local maximum of the transform that stands out of the noise of a histogram of n codes, 1 / sqrt(n)
     local = np.flatnonzero((inner[1:-1] > inner[:-2]) & (inner[1:-1] > inner[2:])) + 1
     if len(local) == 0:
         return []
@@ -146,12 +147,14 @@ def electron_peaks(cells: Sequence[Cell], gain: float) -> list[Peaks]:
     height = float(inner[best])
     if height < CLEAR / sqrt(histogram.sum()):
         return []
+    # The top of the parabola through the best bin and its neighbours
     left = inner[best - 1]
     right = inner[best + 1]
     turn = 0.5 * (left - right) / (left - 2 * height + right)
     frequency = (first + best + turn) / size
     codes = np.arange(highest)
     found = []
+    # The size at the frequency states the read noise, beside what rounding to codes takes; the angle states the offset
     for turns in (frequency, 1 - frequency):
         if not first <= turns * size <= last:
             continue

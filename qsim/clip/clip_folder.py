@@ -194,7 +194,7 @@ class ClipFolder:
         """
         self._check_frame(t)
         _, height, width = self.shape
-        y, x, h, w = (0, 0, height, width) if crop is None else check_crop(crop, height, width, str(self.path))
+        y, x, h, w = check_crop(crop, height, width, str(self.path))
         if not self.info.has("saturated", t):
             return np.zeros((h, w), bool)
         return self._channel("saturated", t, "saturated")[y : y + h, x : x + w] != 0

@@ -75,8 +75,10 @@ RGB = (610e-9, 540e-9, 460e-9)  # m, of the bands R, G and B of colour clips unl
 WHITE_PER_MEAN = 2.5  # white of a clip or stream over its mean light: the peak of scores and of requested errors
 
 
-def check_crop(crop: Crop, height: int, width: int, where: str = "") -> Crop:
-    """Return the crop (y, x, h, w) [px] if it lies inside the frame, else raise `ValueError`."""
+def check_crop(crop: Crop | None, height: int, width: int, where: str = "") -> Crop:
+    """Return the crop (y, x, h, w) [px], None: the whole frame; `ValueError` for one that is not inside the frame."""
+    if crop is None:
+        return (0, 0, height, width)
     y, x, h, w = crop
     if y < 0 or x < 0 or h < 1 or w < 1 or y + h > height or x + w > width:
         place = f"{where}: " if where else ""

@@ -419,7 +419,7 @@ class PublishedStream(Stream):
     def _read(self, start: int, stop: int, crop: Crop | None) -> Array:
         self._existing(start, stop)
         _, height, width = self.shape
-        y, x, h, w = (0, 0, height, width) if crop is None else check_crop(crop, height, width, str(self.path))
+        y, x, h, w = check_crop(crop, height, width, str(self.path))
         if not self._described["packed"]:
             return self._published(start, stop, (y, x, h, w))
         row = packing.packed_width(width, self.bits)

@@ -459,6 +459,4 @@ def fireflies_in(halves: Array, broken: Array) -> Array:
 
 
 def _checked_crop(scene: Scene, crop: Crop | None) -> Crop:
-    height = scene.camera.height
-    width = scene.camera.width
-    return (0, 0, height, width) if crop is None else check_crop(crop, height, width)
+    return check_crop(crop, scene.camera.height, scene.camera.width)

@@ -33,6 +33,7 @@ def search(passed: Callable[[Array, Array], Array], top: int, guess: Array) -> A
     `passed`: codes [n] of the pixels int [n] -> bool [n]. The search goes from the guess on in growing strides, then by
     bisection; only undecided pixels are evaluated again.
     """
+    # The step of `low` is passed, that of `high` is not; the code is found where they are neighbours
     low = np.full(len(guess), -1)
     high = np.full(len(guess), top)
     probe = np.clip(guess, 0, max(top - 1, 0)).astype(np.intp)

@@ -38,6 +38,7 @@ def code_law(chain: Chain, code: int, mean: float, chance: Callable[[Array], Arr
     `chance` returns log P(code | n) of electrons [n].
     """
     low, high = _interval(chain, code)
+    # Light and noise as two normal laws: given the code, n lies between the light and the place of the code
     root = np.sqrt(mean)
     variance = mean + chain.noise**2
     nearest = min(max(mean, low), high)
@@ -45,10 +46,12 @@ def code_law(chain: Chain, code: int, mean: float, chance: Callable[[Array], Arr
     reach = SIGMAS * (root * chain.noise + mean) / np.sqrt(variance) + LONGER
     first = floor(max(likeliest - reach, low - FARTHEST * chain.noise - 1, 0.0))
     last = ceil(max(min(likeliest + reach, high + FARTHEST * chain.noise + 1), first))
+    # Terms that differ little are one: steps are half of what light and noise together let n vary
     step = max(1, floor(0.5 * chain.noise * root / (chain.noise + root))) if chain.noise else 1
     parts = []
     blurred = SIGMAS * chain.noise + 1
     cut = last - first > step * 2 * blurred
+    # Where P(code | n) no longer changes, the rest of the sum is a tail of the Poisson law
     if last >= chain.well:
         edge = ceil(chain.well)
         parts.append(_above(edge, mean, float(chance(np.array([chain.well]))[0])))

@@ -283,7 +283,7 @@ class Stream:
         """Return codes [stop - start, h, w] of frames start ... stop - 1; only the bytes of the crop are read."""
         self._existing(start, stop)
         _, height, width = self.shape
-        y, x, h, w = (0, 0, height, width) if crop is None else check_crop(crop, height, width, str(self.path))
+        y, x, h, w = check_crop(crop, height, width, str(self.path))
         # The packed bytes that hold the columns: from the last code that starts on a byte.
         first = x - x % (8 // math.gcd(8, self.bits))
         low = first * self.bits // 8

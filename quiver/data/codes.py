@@ -117,6 +117,11 @@ class Codes:
         return self.shape if self.colour is None else (self.shape[0], 3, *self.shape[1:])
 
     @property
+    def tile(self) -> tuple[int, int]:
+        """Return rows and columns of the pattern of colour filters; (1, 1) without any."""
+        return (1, 1) if self.colour is None else self.colour.tile
+
+    @property
     def bands_determined(self) -> bool:
         """Return whether the colours of the stream's filters determine R, G and B; one filter does not."""
         return self.colour is None or determines_bands(self.colour, self.sensor.efficiency)
@@ -151,7 +156,7 @@ def filled(codes: Codes, bad: Array | None) -> Codes:
     if not bad.any():
         return codes
     marked = bad if codes.defective is None else bad | codes.defective
-    rows, columns = (1, 1) if codes.colour is None else codes.colour.tile  # neighbours of one colour fill a pixel
+    rows, columns = codes.tile  # neighbours of one colour fill a pixel
     places = {(i, j): marked[i::rows, j::columns] for i in range(rows) for j in range(columns)}
     picks = defects.skips_codes(codes.sensor)
     fillers = {place: defects.Filler(own, picks) for place, own in places.items() if own.any()}
@@ -199,6 +204,7 @@ def summed(codes: Codes, asked: PlaneSums) -> Codes:
         if codes.shares is not None:
             raise ArgumentError("planes", f"{codes.name} has exposures that take turns; leave it out")
         sensor = sensor.of_planes(sums.planes)
+    # Exposures take turns by the number of the code: those that are chosen keep theirs
     turns = codes.shares
     if turns is not None:
         turns = tuple(turns[(sums.start + n * sums.step) % len(turns)] for n in range(len(turns)))

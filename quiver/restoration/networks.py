@@ -152,7 +152,7 @@ def excess(codes: Codes, out: Array, first: int) -> str | None:
 
 def settings_of(method: Restorer, codes: Codes) -> tuple[str, str]:
     """Return the precision, and the tiles of a frame where they change the answer, else an empty text."""
-    rows, columns = (1, 1) if codes.colour is None else codes.colour.tile  # each place of a mask is a frame
+    rows, columns = codes.tile  # each place of a mask is a frame
     try:
         cut = method.cut(-(-codes.shape[1] // rows), -(-codes.shape[2] // columns))
     except ValueError:

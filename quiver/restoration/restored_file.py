@@ -265,7 +265,7 @@ def _fill_file(
 
 def _at_a_time(codes: Codes) -> tuple[int, int]:
     """Return height and width of what a method restores at a time: the frame, or one place of a mask."""
-    rows, columns = (1, 1) if codes.colour is None else codes.colour.tile
+    rows, columns = codes.tile
     return -(-codes.shape[1] // rows), -(-codes.shape[2] // columns)
 
 

@@ -224,6 +224,7 @@ def pieces_of_node(
             raise ValueError(f"{document.path}: {where} has no POSITION")
         vertices = document.array(attributes["POSITION"], where, "VEC3").astype(np.float64)
         count = len(vertices)
+        # A vertex belongs to its node, or in shares to the bones of a skin
         if bones is None:
             owners = np.full((count, 1), joint_of[number])
             shares = np.ones((count, 1))
