@@ -26,7 +26,7 @@ import numpy as np
 import result_page
 import torch
 from numpy import ndarray as Array
-from rows import keep_apart
+from rows import keep_apart, restorer_options
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -40,7 +40,6 @@ from quiver.model.mergenet import MergeNet, MergeNetConfig
 from quiver.training import merge_training
 from quiver.training.optimiser import Optimiser
 
-ROOT = Path(__file__).parents[1]
 FORMAT = "quiver-restorer-ablation-2"
 SEEDS = (0, 1)
 PROTOCOL = merge_training.PROTOCOLS["quick"]
@@ -124,16 +123,13 @@ def main(words: list[str] | None = None) -> int:
 
 
 def options() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("photographs", type=Path, help="data set of warped photographs, with a train split")
-    parser.add_argument("rendered", type=Path, help="data set of scenes/restorer.toml, with a train split")
-    parser.add_argument("test", type=Path, help="data set of scenes/restorer_test.toml")
+    data = {
+        "photographs": "data set of warped photographs, with a train split",
+        "rendered": "data set of scenes/restorer.toml, with a train split",
+        "test": "data set of scenes/restorer_test.toml",
+    }
+    parser = restorer_options(__doc__, "restorer_ablation", data)
     parser.add_argument("--rows", default=",".join(VARIANTS), help="comma-separated (default all)")
-    results = ROOT / "docs" / "results" / "restorer_ablation"
-    parser.add_argument("--out", type=Path, default=results, help="folder of the rows")
-    parser.add_argument("--work", type=Path, help="windows, which can be deleted (default out/restorer_ablation)")
-    parser.add_argument("--workers", type=int, default=2, help="processes that draw windows (default 2)")
-    parser.add_argument("--tiny", action="store_true", help="seconds for each row, on tiny windows")
     return parser
 
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import result_page
 from restorer_grid import FRAMES, Place, measured, places
-from rows import keep_apart
+from rows import keep_apart, restorer_options
 
 from qsim.files import VERSION, read_json, write_bytes, write_json
 from qsim.streams.clip import Clip
@@ -30,7 +30,6 @@ from quiver.data.clips import open_clips
 from quiver.model.weights import digest
 from quiver.restoration.restorers import weights_path
 
-ROOT = Path(__file__).parents[1]
 FORMAT = "quiver-restorer-tuned-1"
 CELLS = ("qis-3-3.25", "qis-1-0.5", "qis-7-26")  # the paper's, the least won and the best lit
 START = "mergenet"
@@ -87,17 +86,14 @@ def main(words: list[str] | None = None) -> int:
 
 
 def options() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("photographs", type=Path, help="data set of warped photographs, with a train split")
-    parser.add_argument("rendered", type=Path, help="data set of scenes/restorer.toml, with a train split")
-    parser.add_argument("validation", type=Path, help="data set of scenes/restorer_val.toml, with a val split")
-    parser.add_argument("test", type=Path, help="data set of scenes/restorer_test.toml")
+    data = {
+        "photographs": "data set of warped photographs, with a train split",
+        "rendered": "data set of scenes/restorer.toml, with a train split",
+        "validation": "data set of scenes/restorer_val.toml, with a val split",
+        "test": "data set of scenes/restorer_test.toml",
+    }
+    parser = restorer_options(__doc__, "restorer_tuned", data)
     parser.add_argument("--cells", default=",".join(CELLS), help="comma-separated cells of the grid")
-    results = ROOT / "docs" / "results" / "restorer_tuned"
-    parser.add_argument("--out", type=Path, default=results, help="folder of the rows")
-    parser.add_argument("--work", type=Path, help="runs, which can be deleted (default out/restorer_tuned)")
-    parser.add_argument("--workers", type=int, default=2, help="processes that draw windows (default 2)")
-    parser.add_argument("--tiny", action="store_true", help="seconds for each row")
     return parser
 
 

@@ -284,6 +284,21 @@ def options(text: str | None, folder: str, names: Iterable[str]) -> argparse.Arg
     return parser
 
 
+def restorer_options(text: str | None, folder: str, data: dict[str, str]) -> argparse.ArgumentParser:
+    """Return the options of a program whose rows train the restorer on `data`: names of data sets, each with its help.
+
+    `folder` holds the rows and, elsewhere, what they are made of.
+    """
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, what in data.items():
+        parser.add_argument(name, type=Path, help=what)
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / folder, help="folder of the rows")
+    parser.add_argument("--work", type=Path, help=f"windows and runs, which can be deleted (default out/{folder})")
+    parser.add_argument("--workers", type=int, default=2, help="processes that draw windows (default 2)")
+    parser.add_argument("--tiny", action="store_true", help="seconds for each row, on tiny windows")
+    return parser
+
+
 def keep_apart(folder: str, out: Path, work: Path | None = None, *, trial: bool) -> Path:
     """Return the folder of runs, another for trial rows; `ValueError` if these would stand on the page."""
     if trial and out == ROOT / "docs" / "results" / folder:
