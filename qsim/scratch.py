@@ -217,7 +217,7 @@ def _state(output: Path) -> list[int]:
 def _moves_of(folder: Path, record: bytes) -> list[tuple[str, str]]:
     """Return (file in the folder, name of its output) of what a killed writer had completed and not named.
 
-    Empty if an output is another file than it was then: somebody else's.
+    Empty if an output is another file than it was then, somebody else's, and if one of the new files was lost.
     """
     try:
         stated = json.loads(record)
@@ -226,6 +226,9 @@ def _moves_of(folder: Path, record: bytes) -> list[tuple[str, str]]:
     ours = isinstance(stated, dict) and f"{PREFIX}{stated.get('token')}" == folder.name
     found = stated.get("moves", []) if ours else []
     left = [(new, name, state) for new, name, state in found if (folder / new).is_file()]
+    gone = [(name, state) for new, name, state in found if not (folder / new).is_file()]
+    if any(_state(folder.parent / name) == state for name, state in gone):
+        return []  # a power cut kept the record, and not the names of all new files
     named = all(Path(name).name == name and ".." not in Path(new).parts for new, name, _ in left)
     same = all(_state(folder.parent / name) in ([], state) for _, name, state in left)
     return [(new, name) for new, name, _ in left] if named and same else []

@@ -71,6 +71,7 @@ def _export(source: Source, path: Path, wanted: Export, force: bool) -> ExportIn
         part.mkdir()
         info = EXPORTS[wanted.kind](source, part, wanted, info)
         files.write_json(part / "meta.json", info.values)
+        files.sync_tree(part)
         if path.exists():  # or it appeared meanwhile
             if not force:
                 raise FileExistsError(

@@ -103,7 +103,7 @@ class Folder:
     @contextlib.contextmanager
     def writing(self, name: str) -> Iterator[Path]:
         target = self.path / name
-        target.parent.mkdir(parents=True, exist_ok=True)
+        files.make_folder(target.parent)
         with files.replacing(target) as part:
             yield Path(part.name)
 

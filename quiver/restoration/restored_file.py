@@ -250,6 +250,7 @@ def _fill_file(
             method.into(codes, block, first, _shifted(progress, first, length, len(block)))
             check_finite(block, method.name, first)
             out.flush()
+            _sync(part)
             seconds += time.perf_counter() - started
             reached = Unfinished(
                 **vars(wanted), done=first + len(block), seconds=seconds, threads=threads, device=method.device
@@ -258,9 +259,13 @@ def _fill_file(
     finally:  # the traceback of an error keeps this frame, and a map the disk space of a deleted file
         out = None
         block = None
+    return seconds
+
+
+def _sync(part: Path) -> None:
+    """Sync an unfinished video: a journal records frames only after they are on the disk."""
     with open(part, "rb") as file:
         os.fsync(file.fileno())
-    return seconds
 
 
 def _at_a_time(codes: Codes) -> tuple[int, int]:
