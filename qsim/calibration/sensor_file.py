@@ -153,7 +153,7 @@ def read_counts(
     bits: int | None = None,
     exposure: float | None = None,
 ) -> Array:
-    """Return the frames [T, H, W] of an `.npy` or a stream, read when they are used, or of a `.mat`.
+    """Return the frames [T, H, W] of an `.npy` or a stream, read when they are used, of a `.mat`, or of photon times.
 
     With `hints` other than the `variable` of a `.mat`, of any recording of `convert`, all in memory. `ValueError` or
     `FileNotFoundError` naming the file, also for a stream of other `bits`, or whose codes have another `exposure` [s].
@@ -177,6 +177,13 @@ def read_counts(
         if recording.is_light:
             raise ValueError(f"{path}: holds {recording.format} of light, not counts")
         return recording.read(0, recording.shape[0])
+    if path.suffix.lower() == ".npz" and bits is not None and exposure is not None:
+        return _photon_codes(path, bits, exposure, None)
+    return _frames(path)
+
+
+def _frames(path: Path) -> Array:
+    """Return the frames [T, H, W] of an `.npy`; an array [H, W] is one frame."""
     stored = load_array(path)
     array = cast(Array, stored[None] if stored.ndim == 2 else stored)
     if array.ndim != 3 or array.size == 0:

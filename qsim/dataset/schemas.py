@@ -8,6 +8,7 @@ They come from the records that read these files, so that they hold the same nam
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import sys
 from pathlib import Path
 from typing import Any, Literal
@@ -69,6 +70,8 @@ def _closed(schema: Any) -> Any:
     if not isinstance(schema, dict):
         return schema
     found = {key: _closed(value) for key, value in schema.items() if (key, value) != ("default", None)}
+    if isinstance(found.get("description"), str):
+        found["description"] = inspect.cleandoc(found["description"])  # as Python 3.13 keeps it
     if "properties" in found and isinstance(found["properties"], dict) and found.get("type") == "object":
         found.setdefault("additionalProperties", False)
     alternatives = [item for item in found.get("anyOf", []) if item != _NULL]

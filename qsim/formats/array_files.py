@@ -182,7 +182,7 @@ def read_zarr(path: Path, hints: Hints) -> Recording:
         if float(np.prod(stored, dtype=float)) * array.dtype.itemsize > limits.CHUNK:
             raise ValueError(f"{path}: chunks of {list(stored)} pixels; up to {limits.CHUNK} bytes are read at a time")
         wanted = math.prod(-(-n // chunk) for n, chunk in zip(shape, stored, strict=True))
-        found = _count_files(folder, wanted)  # before the library lists all the chunks that there should be
+        found = _count_files(folder, wanted, path)  # before the library lists all the chunks that there should be
         if found >= wanted:
             found = min(found, array.nchunks_initialized) if stored == array.chunks else found
         if found < wanted:
@@ -206,6 +206,7 @@ def _zarr_codecs(path: Path, folder: Path) -> set[str]:
     described = [folder / name for name in ("zarr.json", ".zarray") if (folder / name).is_file()]
     for file in [*described, *(path / name for name in ("zarr.json", ".zattrs", ".zgroup")), folder / ".zattrs"]:
         if file.is_file():
+            opening.regular(file, "description", beside=path)
             parse_json(file, opening.text(file, "description", most=limits.METADATA))
     found: set[str] = set()
     for file in described:
@@ -225,11 +226,19 @@ def _zarr_codecs(path: Path, folder: Path) -> set[str]:
     return {name.removeprefix("numcodecs.") for name in found}
 
 
-def _count_files(folder: Path, enough: int) -> int:
-    """Count the files below a folder without zarr's metadata, up to `enough`."""
+def _count_files(folder: Path, enough: int, beside: Path) -> int:
+    """Count the files below a folder without zarr's metadata, up to `enough`.
+
+    `ValueError` for a link out of the folder `beside`.
+    """
     count = 0
-    for _, _, names in os.walk(folder):
-        count += sum(name not in _ZARR_METADATA for name in names)
+    for place, _, names in os.walk(folder):
+        chunks = [name for name in names if name not in _ZARR_METADATA]
+        for name in chunks:
+            file = Path(place) / name
+            if file.is_symlink():
+                opening.regular(file, "chunk", beside=beside)
+        count += len(chunks)
         if count >= enough:
             break
     return count

@@ -108,7 +108,10 @@ class Folder:
             yield Path(part.name)
 
     def remove(self, name: str) -> None:
-        (self.path / name).unlink(missing_ok=True)
+        file = self.path / name
+        with contextlib.suppress(FileNotFoundError):
+            file.unlink()
+            files.sync_folder(file.parent)  # what is deleted later is not lost before it
 
     def sweep(self) -> None:
         """Delete what killed writers left."""

@@ -17,7 +17,9 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from qsim import files, records
 from qsim.checks import SPLITS
@@ -25,6 +27,7 @@ from qsim.dataset.clip_list import ClipList
 from qsim.dataset.dataset import Dataset, Part, checked_part
 from qsim.files import Progress
 from qsim.host import own_numbers
+from qsim.kinds import Positive
 from qsim.notebook import reporting
 from qsim.publishing import croissant, data_card
 from qsim.publishing.contents import FIELDS, Field, Sample, sample_of, sensed
@@ -53,17 +56,24 @@ MOST_CLIPS = 1000  # of a shard
 BYTES = {"flow": 8, "flow_back": 8, "valid": 1, "depth": 4, "body_id": 4, "saturated": 0}  # of a pixel
 PICTURED = 4  # clips in the data card
 
+Fields = Annotated[tuple[Field, ...], Meta(min_length=1)]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Publication:
     """What is published of each clip, and how."""
 
     to: Kind = "webdataset"
-    fields: tuple[Field, ...] = FIELDS
+    fields: Fields = FIELDS
     packed: bool = False  # codes as packed bits
-    shard_size: float = 256.0  # MB, about
+    shard_size: Positive = 256.0  # MB, about
     licence: str | None = None  # of the set, as in CC-BY-4.0
     sensings: tuple[Sensing, ...] = ()  # codes that are drawn; without any, those of the stored streams
+
+    def __post_init__(self) -> None:
+        kinds: dict[str, Any] = {"to": Kind, "fields": Fields, "shard_size": Positive}
+        for name, kind in kinds.items():
+            object.__setattr__(self, name, records.convert(getattr(self, name), kind, name))
 
 
 @dataclass(frozen=True)
@@ -294,11 +304,13 @@ def _check_folder(where: Folder) -> None:
 
 
 def _clear(where: Place, names: Sequence[str]) -> None:
-    """Delete a published set: first what says that it is complete, then the records of its shards, then the rest."""
+    """Delete a published set: first what says that it is complete, then the records, last the shards: they prove it."""
     order = (SET, CROISSANT, CARD)
     first = [name for name in order if name in names]
     then = [name for name in names if name.startswith("records/")]
-    for name in dict.fromkeys([*first, *then, *names]):
+    last = [name for name in names if name.startswith("shards/")]
+    rest = [name for name in names if name not in last]
+    for name in dict.fromkeys([*first, *then, *rest, *last]):
         where.remove(name)
 
 

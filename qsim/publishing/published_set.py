@@ -111,6 +111,22 @@ class PublishedSet:
     def _count(self, split: Any) -> int:
         return sum(shard.clips for shard in self.info.shards[split])
 
+    def _check_size(self, shard: ShardSummary) -> None:
+        """Raise `ValueError` for a shard of another size than when it was published; each is asked for once."""
+        if shard.file in self._sized:
+            return
+        size = self.where.size(shard.file)
+        if size is not None and size != shard.size:  # a missing one is named when it is opened
+            raise ValueError(
+                f"{self.address}/{shard.file}: has {size} bytes, not the {shard.size} it was published with; {CURE}"
+            )
+        self._sized.add(shard.file)
+
+    @cached_property
+    def _sized(self) -> set[str]:
+        """The shards whose size was compared."""
+        return set()
+
     @cached_property
     def where(self) -> Place:
         """The place of its files."""
@@ -126,6 +142,7 @@ class PublishedSet:
         number = bisect_right(self._ends[split], position)
         shard = self.info.shards[split][number]
         before = self._ends[split][number - 1] if number else 0
+        self._check_size(shard)
         return PublishedClip.of(self, shard, read_place(self.where, shard, position - before))
 
 

@@ -66,6 +66,13 @@ def test_files_that_belong_together_are_named_together(tmp_path: Path, names: st
     assert {(tmp_path / name).read_text() for name in "abc"} == {"new"}
 
 
+def test_files_of_which_a_power_cut_lost_one_are_not_named(tmp_path: Path):
+    killed_while_naming(tmp_path)
+    (tmp_path / "a").unlink()
+    sweep(tmp_path)
+    assert os.listdir(tmp_path) == []
+
+
 def test_a_file_that_somebody_put_there_meanwhile_stays(tmp_path: Path):
     killed_while_naming(tmp_path)
     (tmp_path / "b").write_text("precious")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 from pathlib import Path
 
@@ -56,11 +57,11 @@ READS = {  # what reads -> what it is given
     "qsim convert clip e --to nerfstudio": ("clip",),
     "qsim convert clip e.h5 --window 2": ("clip",),
     "qsim calibrate --model spad --bits 1 --dark planes.npy 1e-5 -o s.toml": ("planes.npy",),
-    "qsim calibrate --bits 12 --static photons.npz 1e-5 -o s.toml": ("photons.npz",),
+    "qsim calibrate --bits 12 --static photons.npz 5e-5 -o s.toml": ("photons.npz",),
     "qsim tradeoff clip --ppp 3 --bits 1,2": ("clip",),
     "quiver restore clip --stream s -o n.npy --method moment": ("clip",),
     "quiver restore clip/streams/b.npy -o n.npy --method moment": ("clip",),
-    "quiver restore codes.npy --sensor my.toml --ppp 3 -o n.npy --method moment": ("codes.npy", "my.toml"),
+    "quiver restore codes.npy --sensor my.toml -o n.npy --method moment": ("codes.npy", "my.toml"),
     "quiver restore clip --stream s -o n.npy --method run/best.safetensors": ("clip", "run"),
     "quiver evaluate data -o e --methods naive --ppp 3": ("data",),
     "quiver evaluate --static static.npy --methods naive --splits 1": ("static.npy",),
@@ -69,6 +70,7 @@ READS = {  # what reads -> what it is given
     "quiver convert-weights their.pth -o o.safetensors": ("their.pth",),
     "quiver train data -o run --preset unet --protocol control --steps 2 --crop 16 --batch 1": ("data", "run"),
 }
+REFUSED = ("qsim plan", "qsim calibrate --bits 12 --static photons.npz", "quiver domain")  # also with good files
 
 
 def write_inputs(folder: Path) -> None:
@@ -100,12 +102,10 @@ def write_inputs(folder: Path) -> None:
     for line in (
         "restore clip --stream s -o r.npy --method moment",
         "evaluate clip -o table --methods naive --ppp 3",
-        "train data -o run --preset unet --protocol control --steps 1 --crop 16 --batch 1",
+        "train data -o run --preset unet --protocol control --steps 2 --crop 16 --batch 1",
     ):
-        words = [
-            str(folder / word) if word in ("clip", "r.npy", "table", "data", "run") else word for word in line.split()
-        ]
-        assert quiver.cli.program.main([*words, "-q"]) == 0
+        with contextlib.chdir(folder):  # a run states its data as they were named
+            assert quiver.cli.program.main([*line.split(), "-q"]) == 0
 
 
 def _foreign(folder: Path, codes: np.ndarray, static: np.ndarray) -> None:

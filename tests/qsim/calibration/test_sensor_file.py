@@ -82,6 +82,7 @@ def test_photon_times_are_calibrated_as_the_counts_of_their_pixels(tmp_path):
     photon_times.write(stream, path)
     found = read_stack(path, bits=8, exposure=5e-4, photons=None)
     assert np.array_equal(found.total, stream.codes().sum(axis=0, dtype=float))
+    assert np.array_equal(read_counts(path, bits=8, exposure=5e-4), stream.codes())
     few = read_stack(path, bits=3, exposure=5e-4, photons=None)
     assert np.array_equal(few.total, np.minimum(stream.codes(), 7).sum(axis=0, dtype=float))
     planes = photon_times.read(path).clocked(50)

@@ -138,6 +138,17 @@ def test_zarr_without_frames_or_with_missing_chunks(tmp_path: Path):
         importing.read(tmp_path / "m.zarr")
 
 
+@pytest.mark.parametrize("name", ["zarr.json", "frames/zarr.json", "frames/c/0/0/0"])
+def test_zarr_that_links_out_of_its_folder(tmp_path: Path, name: str):
+    pytest.importorskip("zarr")
+    array_files.write_zarr(tmp_path / "m.zarr", iter([random_planes(4, 5, 7)]), (4, 5, 7), {})
+    file = tmp_path / "m.zarr" / name
+    file.rename(tmp_path / "elsewhere")
+    file.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ValueError, match=f"{name}: is a link out of"):
+        importing.read(tmp_path / "m.zarr")
+
+
 def test_single_photon_challenge_cubes(tmp_path: Path):
     expected = random_planes(16, 6, 16, 3)
     np.save(tmp_path / "000.npy", np.packbits(expected, axis=2))
