@@ -130,8 +130,8 @@ def test_a_clip_of_planes_resumes_and_states_the_errors_of_its_codes(tmp_path):
     info = whole.info
     assert (len(info.error_per_frame), len(info.error_per_code), len(info.error_at_white_per_code)) == (7, 2, 2)
     assert stated(info).line.endswith("of the mean of 3 frames and of its sharp middle")
-    assert max(info.error_per_code) < min(info.error_per_frame)
-    assert not np.array_equal(whole.sharp(1), whole.radiance(1))
+    assert max(info.error_per_code) < np.median(info.error_per_frame)
+    assert np.array_equal(whole.sharp(1), whole.radiance(1)) == (not budget.denoise)  # the planes share one picture
     np.testing.assert_array_equal(whole.sharp(2), whole.radiance(2))
 
 
