@@ -59,6 +59,7 @@ class Roughness(TypedDict):
 class Surface(TypedDict):
     pbrMetallicRoughness: NotRequired[Roughness]
     normalTexture: NotRequired[NormalInfo]
+    occlusionTexture: NotRequired[TextureInfo]
     emissiveTexture: NotRequired[TextureInfo]
     emissiveFactor: NotRequired[tuple[Part, Part, Part]]
     alphaMode: NotRequired[Literal["OPAQUE", "MASK", "BLEND"]]
@@ -173,6 +174,8 @@ class _Reading:
     def surface(self, colours: np.ndarray | None) -> MetallicRoughness:
         """Return the material on vertices of these colours [V, 3]."""
         extensions = self._about.get("extensions", {})
+        if "occlusionTexture" in self._about:
+            self._tell("its occlusion is left out, because light is traced")
         base = self._reflectance(colours)
         if "KHR_materials_unlit" in extensions:
             if isinstance(base, VertexColours):

@@ -266,10 +266,12 @@ def test_all_animations_play_unless_two_move_the_same(tmp_path: Path):
 
 
 def test_what_is_left_out_is_told_and_what_is_required_refused(tmp_path: Path):
-    volume = {"extensions": {"KHR_materials_volume": {}}}
+    volume = {"extensions": {"KHR_materials_volume": {}}, "occlusionTexture": {"index": 0}}
     file = stage([{"mesh": 0}], [volume], extensionsUsed=["KHR_materials_volume"])
     del file.content["nodes"][0]["extensions"]
-    with pytest.warns(UserWarning, match="the extension KHR_materials_volume; no light: lit evenly by 1 W"):
+    with pytest.warns(
+        UserWarning, match="the extension KHR_materials_volume; .*occlusion.*; no light: lit evenly by 1 W"
+    ):
         scene = read(file, tmp_path)
     assert isinstance(scene.lights[0], Constant)
     file.content["extensionsRequired"] = ["KHR_materials_volume"]
