@@ -84,7 +84,7 @@ def load(
 
     `asset_folder.py` states what a folder may hold, `gltf_file.py` what becomes of an animated .glb or .gltf. An XML
     scene stands still and has no seed: a Python file that calls `qsim.read_mitsuba` moves its shapes. With
-    `bands="rgb"` an XML scene, or a glTF file with a camera, is read in colour; others are coloured afterwards
+    `bands="rgb"` an XML scene, a glTF file and a folder with one are read in colour; others are coloured afterwards
     (colours.py). `camera` names one of a glTF file, and `start` [s] is the time of its animations at t = 0.
     `FileNotFoundError` for a missing file; `ValueError` for a name that is none of these, for a speed outside 0.001
     to 1000, and for one other than 1 that changes no motion of a .py or .xml scene, unless its camera will move
@@ -108,7 +108,7 @@ def load(
         _check_moves(name, speed=speed != 1 and not along_path, start=start is not None)
         return gltf_file.scene(seed, speed=speed, file=name, camera=camera, start=start or 0.0, bands=bands)
     if Path(name).is_dir() and not (Path(name) / "clip.json").is_file():
-        return asset_folder.scene(seed, speed=speed, folder=name)
+        return asset_folder.scene(seed, speed=speed, folder=name, bands=bands)
     raise ValueError(_no_scene(name))
 
 

@@ -10,26 +10,34 @@ seeds the camera flies by: at least 30 % of the pixels move.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from qsim import files
 from qsim.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture, Translation
+from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
+from qsim.scene.animated.gltf_scene import gltf_parts
+from qsim.scene.motion import Motion
 from qsim.scene.rotation import pose_matrix, vector
 from qsim.scene.shapes import MESH_SUFFIXES, mesh_file, mesh_material, moved
 from qsim.scene.textures import PICTURE_SUFFIXES
 from qsim.scenes import common, tumble
+from qsim.scenes.colours import with_parts
 from qsim.scenes.common import any_angle, between, pick
 
 ENVIRONMENT_SUFFIXES = frozenset({".hdr", ".exr"})
 SUFFIXES = MESH_SUFFIXES | PICTURE_SUFFIXES | ENVIRONMENT_SUFFIXES
 
 
-def scene(seed: int = 0, *, speed: float = 1.0, folder: str | Path) -> Scene:
+def scene(seed: int = 0, *, speed: float = 1.0, folder: str | Path, bands: Literal["rgb"] | None = None) -> Scene:
     """Return six to nine bodies of the folder's meshes and textures in free flight, as in `tumble`.
 
     The camera flies by at 1 to 3 m/s at speed 1, but is at rest where the seed is a multiple of 3.
+    A glTF file keeps its materials, as a body for each. Other meshes keep their colours in a matt or glossy finish.
+    With `bands="rgb"` a scene with glTF files is read in colour; others are coloured afterwards.
     `FileNotFoundError` if the folder has none of these files; `ValueError` names a file that cannot be read.
     """
     meshes, pictures, environments = assets(folder)
@@ -38,14 +46,22 @@ def scene(seed: int = 0, *, speed: float = 1.0, folder: str | Path) -> Scene:
         common.floor(_material(rng, pictures), 2.4, y=-0.18, z=-0.2),
         common.wall(_material(rng, pictures), 2.4, 1.2, z=-0.6, y=0.35),
     ]
+    kept: list[Body] = []  # with the materials of their files
     for i, place in enumerate(tumble.spread(rng, int(rng.integers(6, 10)))):
         motion = tumble.thrown(rng, place, speed)
-        mesh, own = _mesh(rng, meshes)
+        path, size = _chosen(rng, meshes)
+        solid = None if path is not None else moved(tumble.shape(rng), pose_matrix(2.5 * np.eye(3)))
         drawn = _material(rng, pictures)
-        bodies.append(Body(f"body {i}", mesh, drawn if own is None else common.finished(own, drawn), motion))
+        if path is not None and path.suffix.lower() in GLTF_SUFFIXES:
+            parts = gltf_parts(path, size, bands=bands)
+            kept += [replace(part, name=f"body {i}, part {k}", motion=motion) for k, part in enumerate(parts)]
+            if parts:
+                continue
+        bodies.append(_body(f"body {i}", solid, path, size, drawn, motion))
     flight = None if seed % 3 == 0 else _flight(rng, speed)
     view = common.camera((0.0, between(rng, 0.02, 0.14), 0.65), (0, 0, 0), 0.5, flight)
-    return Scene(Path(folder).resolve().name, seed, view, (_light(rng, environments),), tuple(bodies), speed)
+    made = Scene(Path(folder).resolve().name, seed, view, (_light(rng, environments),), tuple(bodies), speed)
+    return with_parts(made, kept, bands)
 
 
 def assets(folder: str | Path) -> tuple[list[Path], list[Path], list[Path]]:
@@ -59,12 +75,20 @@ def assets(folder: str | Path) -> tuple[list[Path], list[Path], list[Path]]:
     return meshes, pictures, environments
 
 
-def _mesh(rng: np.random.Generator, meshes: list[Path]) -> tuple[Mesh, Material | None]:
-    """Return a mesh of the folder with its own colours, if any, or a solid, 8 to 16 cm across."""
-    if meshes:
-        path = pick(rng, meshes)
-        return mesh_file(path, size=between(rng, 0.08, 0.16)), mesh_material(path)
-    return moved(tumble.shape(rng), pose_matrix(2.5 * np.eye(3))), None
+def _chosen(rng: np.random.Generator, meshes: list[Path]) -> tuple[Path | None, float]:
+    """Return a mesh of the folder, None without any, and how long it becomes: 8 to 16 cm."""
+    if not meshes:
+        return None, 0.0
+    return pick(rng, meshes), between(rng, 0.08, 0.16)
+
+
+def _body(name: str, solid: Mesh | None, path: Path | None, size: float, drawn: Material, motion: Motion) -> Body:
+    """Return a solid, or a mesh of the folder with its own colours, if any, in the finish that was drawn."""
+    if solid is not None:
+        return Body(name, solid, drawn, motion)
+    assert path is not None
+    own = mesh_material(path)
+    return Body(name, mesh_file(path, size=size), drawn if own is None else common.finished(own, drawn), motion)
 
 
 def _flight(rng: np.random.Generator, speed: float) -> Translation:

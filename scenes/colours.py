@@ -6,8 +6,9 @@ Shapes, motions and cameras stay as they are, and the mean light over the bands 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from qsim.colour import hue_from_turns
 from qsim.keys import hash_name
 from qsim.scene import (
     AreaLamp,
+    Body,
     Constant,
     EnvironmentImage,
     Light,
@@ -50,6 +52,14 @@ def coloured(scene: Scene) -> Scene:
             painted[id(body.material)] = _painted(body.material, rng)
     bodies = tuple(replace(body, material=painted[id(body.material)]) for body in scene.bodies)
     return replace(scene, bands=RGB, bodies=bodies, lights=tuple(_lit(light, rng) for light in scene.lights))
+
+
+def with_parts(scene: Scene, parts: Sequence[Body], bands: Literal["rgb"] | None) -> Scene:
+    """Return a scene with more bodies, which have the colours of their files; with `bands` the others are coloured."""
+    if not parts:
+        return scene
+    base = scene if bands is None else coloured(scene)
+    return replace(base, bodies=(*base.bodies, *parts))
 
 
 def _painted(material: Material, rng: np.random.Generator) -> Material:

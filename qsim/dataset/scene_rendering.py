@@ -162,8 +162,9 @@ def load_scene(
 
 
 def in_colour(scene: Scene, name: str) -> bool:
-    """Return whether a scene was read in the colours of its file, of Mitsuba or of glTF."""
-    return scene.bands is not None and (scene.file is not None or name.endswith(GLTF_SUFFIXES))
+    """Return whether a scene was read in the colours of its files, of Mitsuba or of glTF."""
+    of_files = scene.file is not None or name.endswith(GLTF_SUFFIXES) or Path(name).is_dir()
+    return scene.bands is not None and of_files
 
 
 def _warn_of_another_view(scene: Scene, size: tuple[int, int]) -> None:

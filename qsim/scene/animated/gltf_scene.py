@@ -49,9 +49,10 @@ from qsim.scene.animated.gltf_nodes import (
 )
 from qsim.scene.animated.gltf_surfaces import MATERIALS, Surfaces
 from qsim.scene.animated.gltf_views import PUNCTUAL, camera_names, camera_of, light_of
-from qsim.scene.animated.skinning import Placed
+from qsim.scene.animated.skinning import Joint, Placed
 from qsim.scene.animated.tracks import Clock, Fixed, Keyed, rotation_of
 from qsim.scene.lights import Constant, Light
+from qsim.scene.rotation import pose_matrix
 from qsim.scene.scene import Body, Mesh, Scene
 
 INSTANCES = "EXT_mesh_gpu_instancing"
@@ -126,6 +127,51 @@ def read_gltf(
     return seen
 
 
+def gltf_parts(
+    path: str | Path,
+    size: float,
+    *,
+    pose: np.ndarray | None = None,
+    animation: str | None = None,
+    speed: float = 1.0,
+    start: float = 0.0,
+    bands: Literal["rgb"] | None = None,
+) -> tuple[Body, ...]:
+    """Return the meshes of a .glb or .gltf file as bodies with its materials; none if it states no material or colour.
+
+    The bounding box of the first pose is centred, its longest side becomes `size` [m], and `pose` [4, 4] places it.
+    The `animation` of this name plays again and again at `speed`, from `start` [s] on; without a name nothing moves.
+    Cameras and lights are left out. Colours, errors and warnings are as of `read_gltf`.
+    """
+    document = unpacked(open_document(Path(path), UNDERSTOOD))
+    file = _File(document)
+    played = {} if animation is None else file.played(animation)
+    length = max((float(track.times[-1]) for track in played.values()), default=0.0)
+    clock = Clock(speed, start, length, repeat=True)
+    coloured = bands == "rgb"
+    as_stored = _Stage(file, played, clock, coloured)
+    if not as_stored.has_materials():
+        return ()
+    corners = np.concatenate([in_first_pose(body) for body in as_stored.bodies()])
+    low = corners.min(axis=0)
+    high = corners.max(axis=0)
+    longest = float((high - low).max())
+    if not longest > 0:
+        raise ValueError(f"{path}: all its vertices lie in one point")
+    scale = size / longest
+    centred = pose_matrix(scale * np.eye(3), -scale * (low + high) / 2)
+    stage = _Stage(file, played, clock, coloured, centred if pose is None else pose @ centred)
+    bodies = tuple(stage.bodies())
+    stage.warn()
+    return bodies
+
+
+def in_first_pose(body: Body) -> np.ndarray:
+    """Return the vertices of a body in the world at t = 0, [V, 3]."""
+    pose = body.pose(0.0)
+    return body.vertices(0.0) @ pose[:3, :3].T + pose[:3, 3]
+
+
 def _glows(body: Body) -> bool:
     return bool(getattr(body.material, "glows", False))
 
@@ -182,7 +228,9 @@ class _File:
 class _Stage:
     """What a file shows while its animations play."""
 
-    def __init__(self, file: _File, tracks: Tracks, clock: Clock, coloured: bool) -> None:
+    def __init__(
+        self, file: _File, tracks: Tracks, clock: Clock, coloured: bool, place: np.ndarray | None = None
+    ) -> None:
         self._file = file
         self._document = file.document
         self._tracks = tracks
@@ -190,6 +238,9 @@ class _Stage:
         self._coloured = coloured
         self._told: dict[str, None] = {}
         self._joints, self._joint_of = joints_of(self._document, file.nodes, tracks, file.order, file.parents)
+        self._place = () if place is None else (Fixed(place),)  # of the complete file
+        if self._place:
+            self._joints[0] = Joint(self._place[0])
         self._paints = Paints(self._document, complete=True)
         self._surfaces = Surfaces(self._document, self._paints, coloured, self.tell)
         for name in self._document.content.get("extensionsUsed", []):
@@ -254,6 +305,11 @@ class _Stage:
         if not names:
             raise ValueError(f"{self._document.path}: its scene has no mesh")
 
+    def has_materials(self) -> bool:
+        """Return whether the file states a material or colours for any of its faces."""
+        pieces = (piece for i in self._file.shown if "mesh" in self._file.nodes[i] for piece in self._pieces(i))
+        return any(piece.material is not None or piece.colours is not None for piece in pieces)
+
     def _pieces(self, i: int) -> Iterator[FilePiece]:
         """Yield the primitives of a node, repeated for each of its instances."""
         nodes = self._file.nodes
@@ -307,7 +363,7 @@ class _Stage:
         return found[::-1]
 
     def _chain(self, node: int) -> tuple[Placed, ...]:
-        return tuple(self._joints[self._joint_of[i]].motion for i in self._ancestors(node))
+        return (*self._place, *(self._joints[self._joint_of[i]].motion for i in self._ancestors(node)))
 
     def _moves(self, node: int) -> bool:
         """Return whether any placement above a node changes over time."""
