@@ -27,3 +27,8 @@ def test_a_row_of_another_length_is_refused():
         markdown_table([("a",)], ("a", "b"))
     with pytest.raises(ValueError, match="zip"):
         text_table([("a",)], ("a", "b"))
+
+
+def test_a_cell_is_one_line():
+    assert text_table([("a\nb\x1b", "1")], ("name", "n")) == ["name      n", "a\\nb\\x1b  1"]
+    assert markdown_table([("a\nb", "1")], ("name", "n"))[2] == "| a\\nb | 1 |"
