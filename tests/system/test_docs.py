@@ -306,6 +306,25 @@ def test_readme_and_changelog_are_short():
     assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 40
 
 
+WRITTEN = ("evidence.md", "million.md", "log.md")  # by programs, and the laboratory book
+
+
+@pytest.mark.parametrize(
+    "page", [p for p in sorted((ROOT / "docs").glob("*.md")) if p.name not in WRITTEN], ids=lambda p: p.stem
+)
+def test_lines_of_prose_can_be_read(page: Path):
+    """At most 110 characters, but in tables, code, formulas, pictures and what a program wrote."""
+    text = page.read_text(encoding="utf-8")
+    for kept in (
+        r"^[ ]*```.*?^[ ]*```",
+        r"^<!-- generated.*?^<!-- end -->",
+        r"^[ ]*\$\$.*?\$\$",
+        r"^(\||!\[|<!--|    ).*?$",
+    ):
+        text = re.sub(kept, "", text, flags=re.MULTILINE | re.DOTALL)
+    assert [line for line in text.splitlines() if len(line) > 110] == []
+
+
 def test_files_named_on_the_page_of_the_architecture_exist():
     """Full paths, and names after one of them."""
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
