@@ -309,20 +309,23 @@ def test_readme_and_changelog_are_short():
 WRITTEN = ("evidence.md", "million.md", "log.md")  # by programs, and the laboratory book
 
 
-@pytest.mark.parametrize(
-    "page", [p for p in sorted((ROOT / "docs").glob("*.md")) if p.name not in WRITTEN], ids=lambda p: p.stem
-)
-def test_lines_of_prose_can_be_read(page: Path):
-    """At most 110 characters, but in tables, code, formulas, pictures and what a program wrote."""
+PROSE = [path for path in sorted((ROOT / "docs").glob("*.md")) if path.name not in WRITTEN]
+PROSE += [ROOT / "README.md", ROOT / "scenes" / "README.md"]
+NO_PROSE = (r"^ *```.*?^ *```", r"^<!-- generated.*?^<!-- end -->", r"^ *\$\$.*?\$\$", r"^(\||!\[|<!--|    |#).*?$")
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_prose_can_be_read(page: Path):
+    """Lines of at most 110 characters, sentences of at most 25 words; a formula and code count as a word."""
     text = page.read_text(encoding="utf-8")
-    for kept in (
-        r"^[ ]*```.*?^[ ]*```",
-        r"^<!-- generated.*?^<!-- end -->",
-        r"^[ ]*\$\$.*?\$\$",
-        r"^(\||!\[|<!--|    ).*?$",
-    ):
-        text = re.sub(kept, "", text, flags=re.MULTILINE | re.DOTALL)
+    for left_out in NO_PROSE:
+        text = re.sub(left_out, "\n", text, flags=re.MULTILINE | re.DOTALL)
     assert [line for line in text.splitlines() if len(line) > 110] == []
+    for shown, plain in ((r"\[([^\]]*)\]\([^)]*\)", r"\1"), (r"\$[^$]*\$", "X"), (r"`[^`]*`", "X")):
+        text = re.sub(shown, plain, text)
+    paragraphs = re.split(r"\n\s*\n|\n\s*(?:[-*]|\d+\.) ", text)
+    sentences = [each for one in paragraphs for each in re.split(r"(?<=[.!?:;])\s+", one)]
+    assert [each for each in sentences if len(each.split()) > 25] == []
 
 
 def test_files_named_on_the_page_of_the_architecture_exist():
