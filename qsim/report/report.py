@@ -240,7 +240,7 @@ def restored_section(path: Path) -> page.Section:
             wheel = legend(largest)
     lines.append(f"Brightest light shown: {white:.3g} photons.")
     which = of_first(frames, len(restored))
-    found = f" at {own.score} PSNR{which}" if own.score else ""
+    found = f" with a PSNR of {own.score}{which}" if own.score else ""
     seen = (
         f"{clip.name}, seen as {stream.name},"
         if truth is not None and clip is not None and stream is not None

@@ -65,7 +65,7 @@ def training_section(path: Path) -> page.Section:
     steps = f"{history[-1]['step']} steps in {history[-1]['elapsed'] / 60:.1f} minutes"
     known = [(entry["elapsed"] / 60, entry["psnr_matched"]) for entry in history if _is_number(entry["psnr_matched"])]
     if not known:
-        story = f"Training {name}: no validation has a finite score."
+        story = f"Training in the folder {name} has no finite score on the validation clips."
         return page.section(f"Training: {name}", page.text(f"{steps}; no validation has a finite score."), story=story)
     minutes, scores = zip(*known, strict=True)
     axes, save = page.axes("minutes of training", "validation PSNR, matched [dB]")
@@ -74,7 +74,8 @@ def training_section(path: Path) -> page.Section:
     last = history[-1]["psnr_matched"]
     axes.plot(minutes[best], scores[best], "o", color="tab:orange", label="best, kept")
     axes.legend()
-    story = f"Training {name} reached {scores[best]:.2f} dB on the validation clips after {minutes[best]:.1f} minutes."
+    reached = f"{scores[best]:.2f} dB on the validation clips after {minutes[best]:.1f} minutes"
+    story = f"Training in the folder {name} reached {reached}."
     story += _drop_after(scores[best], last)
     words = f"{steps}. The weights of the best validation are kept ({scores[best]:.2f} dB); the last one has " + (
         f"{last:.2f} dB." if _is_number(last) else "no finite score."
