@@ -55,10 +55,10 @@ def content(path: Path, what: str = "file", *, most: int = limits.TEXT, beside: 
     return found
 
 
-def text(path: Path, what: str = "file", *, most: int = limits.TEXT) -> str:
+def text(path: Path, what: str = "file", *, most: int = limits.TEXT, beside: Path | None = None) -> str:
     """Return the text of a regular file in UTF-8, without a mark of byte order; `ValueError` for other bytes."""
     try:
-        return content(path, what, most=most).decode("utf-8-sig")
+        return content(path, what, most=most, beside=beside).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: not a text file in UTF-8 ({error}); a {what} is expected") from None
 

@@ -206,8 +206,7 @@ def _zarr_codecs(path: Path, folder: Path) -> set[str]:
     described = [folder / name for name in ("zarr.json", ".zarray") if (folder / name).is_file()]
     for file in [*described, *(path / name for name in ("zarr.json", ".zattrs", ".zgroup")), folder / ".zattrs"]:
         if file.is_file():
-            opening.regular(file, "description", beside=path)
-            parse_json(file, opening.text(file, "description", most=limits.METADATA))
+            parse_json(file, opening.text(file, "description", most=limits.METADATA, beside=path))
     found: set[str] = set()
     for file in described:
         with decoding_errors(file, "JSON"):
