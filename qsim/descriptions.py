@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from qsim import files, records
 from qsim.checks import file_path
-from qsim.parsing import unreadable
+from qsim.parsing import require_readable
 
 FORMAT_VERSION = 1  # of clips, streams, data sets and restored videos; only this one is read
 Made = TypeVar("Made")
@@ -22,8 +22,7 @@ Made = TypeVar("Made")
 def values_of(record: Any) -> dict[str, Any]:
     """Return what the file of a record holds."""
     values = {"format_version": FORMAT_VERSION} | _kind(type(record)) | records.plain(record)
-    if problem := unreadable(values):
-        raise ValueError(f"a description holds {problem}, which no reader accepts")
+    require_readable(values, "a description")
     return sealed(values)
 
 

@@ -64,10 +64,10 @@ def parse_json(path: Path, text: str) -> dict[str, Any]:
     return value
 
 
-def unreadable(value: Any) -> str:
-    """Return why `parse_json` would refuse a value once it is stored; empty if it would not."""
-    problem = _too_much([value], "")
-    return problem[1] if problem else ""
+def require_readable(value: Any, where: str) -> None:
+    """Raise `ValueError` for a value that `parse_json` would refuse once it is stored."""
+    if problem := _too_much([value], ""):
+        raise ValueError(f"{where} would hold {problem[1]}, which no reader accepts")
 
 
 class _NotFinite(ValueError):

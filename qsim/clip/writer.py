@@ -29,7 +29,7 @@ from qsim.files import VERSION, check_name
 from qsim.host import own_numbers
 from qsim.kinds import Count, Digest, NotNegative
 from qsim.optics import radiometry
-from qsim.parsing import unreadable
+from qsim.parsing import require_readable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,8 +68,7 @@ class ClipWriter:
         self.name = check_name(Path(path).name)
         self.path = target_of(path, force)
         self.info = replace(info_of(self.path, info), name=self.name)
-        if problem := unreadable(self.info.asked):
-            raise ValueError(f"{self.path}: its description would hold {problem}, which no reader accepts")
+        require_readable(self.info.asked, f"{self.path}: its description")
         self.part = self.path.with_name(self.path.name + ".part")
         self._frames: dict[int, FrameEntry] = {}
         self._complete = False  # all frames and clip.json are stored

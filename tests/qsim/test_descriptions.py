@@ -238,6 +238,6 @@ def test_a_byte_order_mark_is_skipped(tmp_path):
 def test_what_no_reader_accepts_is_not_written(tmp_path: Path):
     video = RestoredInfo(method="moment", seconds_per_frame=0.1)
     object.__setattr__(video, "device", {"deep": 1 << 64})
-    with pytest.raises(ValueError, match="a description holds a whole number of more than 64 bits"):
+    with pytest.raises(ValueError, match="a description would hold a whole number of more than 64 bits"):
         descriptions.write(tmp_path / "v.json", video)
     assert not list(tmp_path.iterdir())
