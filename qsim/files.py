@@ -93,12 +93,17 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
+def sync_file(path: Path) -> None:
+    """Sync the contents of a file that somebody else wrote, or that was written through a memory map."""
+    with open(path, "rb") as file:
+        os.fsync(file.fileno())
+
+
 def sync_tree(folder: Path) -> None:
     """Sync all files and names in a folder and below, which a library wrote."""
     for place, _, names in os.walk(folder, topdown=False):
         for name in names:
-            with open(os.path.join(place, name), "rb") as file:
-                os.fsync(file.fileno())
+            sync_file(Path(place) / name)
         sync_folder(Path(place))
 
 

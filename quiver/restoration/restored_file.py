@@ -21,7 +21,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import descriptions
-from qsim.files import VERSION, Progress, read_json, sha256, sync_folder
+from qsim.files import VERSION, Progress, read_json, sha256, sync_file, sync_folder
 from qsim.kinds import Count, NotNegative
 from qsim.locks import Lock
 from qsim.restored_video import Restored, RestoredInfo, VideoInfo, describes_restored
@@ -250,7 +250,7 @@ def _fill_file(
             method.into(codes, block, first, _shifted(progress, first, length, len(block)))
             check_finite(block, method.name, first)
             out.flush()
-            _sync(part)
+            sync_file(part)  # the journal records frames that are on the disk
             seconds += time.perf_counter() - started
             reached = Unfinished(
                 **vars(wanted), done=first + len(block), seconds=seconds, threads=threads, device=method.device
@@ -260,12 +260,6 @@ def _fill_file(
         out = None
         block = None
     return seconds
-
-
-def _sync(part: Path) -> None:
-    """Sync an unfinished video: a journal records frames only after they are on the disk."""
-    with open(part, "rb") as file:
-        os.fsync(file.fileno())
 
 
 def _at_a_time(codes: Codes) -> tuple[int, int]:
