@@ -305,12 +305,13 @@ def _check_folder(where: Folder) -> None:
 
 def _clear(where: Place, names: Sequence[str]) -> None:
     """Delete a published set: first what says that it is complete, then the records, last the shards: they prove it."""
-    order = (SET, CROISSANT, CARD)
-    first = [name for name in order if name in names]
-    then = [name for name in names if name.startswith("records/")]
-    last = [name for name in names if name.startswith("shards/")]
-    rest = [name for name in names if name not in last]
-    for name in dict.fromkeys([*first, *then, *rest, *last]):
+
+    def rank(name: str) -> int:
+        if name in (SET, CROISSANT, CARD):
+            return (SET, CROISSANT, CARD).index(name)
+        return {"records": 3, "shards": 5}.get(name.partition("/")[0], 4)
+
+    for name in sorted(names, key=rank):
         where.remove(name)
 
 
