@@ -1,6 +1,6 @@
 """Measures what a data set of many clips costs beside its clips: seconds, memory, files and bytes of each command.
 
-    python benchmarks/million_clips.py --sizes 1000,10000,100000 --out docs/results/million_clips.json
+    python benchmarks/million_clips.py --sizes 1000,10000,100000,1000000 --out docs/results/million_clips.json
 
 A writer of tiny clips (3 frames of 8 x 8 pixels, one stream) stands in for the renderer. It writes a part of a thousand
 clips. The others have records and descriptions of their own, and their frames and codes are links to the files of the
@@ -387,7 +387,7 @@ def main() -> None:
     parser.add_argument("--sizes", default="1000,10000,100000", help="numbers of clips")
     parser.add_argument("--described", type=int, default=10000, help="most clips of a set that all are described")
     parser.add_argument("--folder", type=Path, help="place for the sets; a temporary folder by default")
-    parser.add_argument("--out", type=Path, help="file of the rows")
+    parser.add_argument("--out", type=Path, help="file of the rows; those of other sizes stay")
     parser.add_argument("--command", choices=COMMANDS, help=argparse.SUPPRESS)
     parser.add_argument("--part", help=argparse.SUPPRESS)
     parser.add_argument("--page", action="store_true", help=f"write {PAGE.name} from {ROWS.name}")
@@ -403,13 +403,14 @@ def main() -> None:
         part, parts = map(int, args.part.split("/"))
         generate(wanted(sizes[0]), args.folder, Options(workers=0, shard=(part, parts)), make=make)
         return
-    rows = []
+    earlier = json.loads(args.out.read_text())["rows"] if args.out and args.out.exists() else []
+    rows = {row["clips"]: row for row in earlier}
     for clips in sizes:
         with tempfile.TemporaryDirectory(dir=args.folder, prefix="million-") as place:
-            rows.append(measure(clips, args.described, Path(place)))
-            print(json.dumps(rows[-1]), flush=True)
-    if args.out:
-        write_json(args.out, {"qsim": VERSION, "part": PART, "rows": rows})
+            rows[clips] = measure(clips, args.described, Path(place))
+            print(json.dumps(rows[clips]), flush=True)
+        if args.out:
+            write_json(args.out, {"qsim": VERSION, "part": PART, "rows": [rows[size] for size in sorted(rows)]})
 
 
 if __name__ == "__main__":
