@@ -8,7 +8,8 @@ its node. Normals are computed again from the vertices. Cameras and lights of th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
@@ -157,15 +158,18 @@ def _read(
     joints, number = joints_of(document, nodes, tracks, order, parents)
     paints = Paints(document)
     pieces: list[FilePiece] = []
+    told: list[str] = []
     for i in shown_nodes(document, nodes, order, parents):
         if "mesh" not in nodes[i]:
             continue
-        for piece in pieces_of_node(document, i, nodes, tracks, joints, number, paints):
+        for piece in pieces_of_node(document, i, nodes, tracks, joints, number, paints, told.append):
             pieces.append(piece)
             if sum(len(each.vertices) for each in pieces) > limits.VERTICES:  # a small file can name one array often
                 raise ValueError(f"{document.path}: its meshes have more than {limits.VERTICES} vertices in all")
     if not pieces:
         raise ValueError(f"{document.path}: its scene has no mesh")
+    if told:
+        warnings.warn(f"{document.path}: {'; '.join(told[:10])}", stacklevel=4)
     return by_paint(pieces), joints
 
 
@@ -206,8 +210,12 @@ def pieces_of_node(
     joints: list[Joint],
     joint_of: Mapping[int, int],
     paints: Paints,
+    tell: Callable[[str], None],
 ) -> Iterator[FilePiece]:
-    """Yield the primitives of a node; joints that a skin adds are appended to `joints`."""
+    """Yield the primitives of a node; joints that a skin adds are appended to `joints`.
+
+    Points and lines of a file that does not move are left out, and `tell` hears of them.
+    """
     node = nodes[number]
     mesh = document.entry("meshes", node["mesh"], MeshEntry, f"nodes[{number}]")
     bones = _bones(document, node["skin"], f"nodes[{number}]", joints, joint_of) if "skin" in node else None
@@ -217,6 +225,7 @@ def pieces_of_node(
         attributes = primitive["attributes"]
         mode = primitive.get("mode", TRIANGLES)
         if POINTS <= mode < TRIANGLES and not tracks:
+            tell(f"{where}: points or lines are left out")
             continue
         if mode not in (TRIANGLES, STRIP, FAN):
             raise ValueError(f"{document.path}: {where} is not made of triangles (mode 4); export triangles")
@@ -351,22 +360,31 @@ def _joined(
     moment = clock.at(0.0)
     reach = check_reach(document, raw)
     first = raw.deform(moment)
-    low = first.min(0)
-    high = first.max(0)
-    longest = float((high - low).max())
-    if not longest > 0:
-        raise ValueError(f"{document.path}: all its vertices lie in one point")
-    scale = 1.0 if size is None else size / longest
+    scale, place = centring(document, first, size)
     if not 2 * reach * scale <= LARGEST:
         raise ValueError(f"{document.path}: scaled by {scale:.2g} to {size:g} m, it moves beyond {LARGEST:g} m")
-    place = Fixed(pose_matrix(scale * np.eye(3), -scale * (low + high) / 2))
-    motion = replace(raw, joints=(Joint(place), *raw.joints[1:]), clock=clock, carrier=carrier)
+    motion = replace(raw, joints=(Joint(Fixed(place)), *raw.joints[1:]), clock=clock, carrier=carrier)
     vertices = motion.deform(0.0)
     uv = np.concatenate([piece.uv for piece in pieces])
+    longest = float(np.ptp(first, axis=0).max())
     uv = np.where(np.isnan(uv), vertices[:, :2] / (longest * scale) + 0.5, uv)
     mirrored = np.linalg.det(motion.matrices(moment)[:, :3, :3]) < 0
     faces = [outward(piece, mirrored) + start for piece, start in zip(pieces, starts, strict=False)]
     return Mesh(vertices, np.concatenate(faces), uv, all(piece.smooth for piece in pieces)), motion
+
+
+def centring(document: Document, vertices: np.ndarray, size: float | None) -> tuple[float, np.ndarray]:
+    """Return the factor that makes the longest side of vertices [V, 3] `size` [m], and the pose that also centres them.
+
+    `ValueError` if they lie in one point.
+    """
+    low = vertices.min(0)
+    high = vertices.max(0)
+    longest = float((high - low).max())
+    if not longest > 0:
+        raise ValueError(f"{document.path}: all its vertices lie in one point")
+    scale = 1.0 if size is None else size / longest
+    return scale, pose_matrix(scale * np.eye(3), -scale * (low + high) / 2)
 
 
 def outward(piece: FilePiece, mirrored: np.ndarray) -> np.ndarray:

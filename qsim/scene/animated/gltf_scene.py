@@ -27,6 +27,7 @@ from qsim.scene.animated.attached import Attached, inverse, placement, rigid_par
 from qsim.scene.animated.draco import unpacked
 from qsim.scene.animated.gltf_body import (
     FilePiece,
+    centring,
     check_reach,
     outward,
     pieces_of_node,
@@ -52,7 +53,6 @@ from qsim.scene.animated.gltf_views import PUNCTUAL, camera_names, camera_of, li
 from qsim.scene.animated.skinning import Joint, Placed
 from qsim.scene.animated.tracks import Clock, Fixed, Keyed, rotation_of
 from qsim.scene.lights import Constant, Light
-from qsim.scene.rotation import pose_matrix
 from qsim.scene.scene import Body, Mesh, Scene
 
 INSTANCES = "EXT_mesh_gpu_instancing"
@@ -99,8 +99,7 @@ def read_gltf(
     document = unpacked(open_document(Path(path), UNDERSTOOD))
     file = _File(document)
     played = file.played(animation)
-    length = max((float(track.times[-1]) for track in played.values()), default=0.0)
-    clock = Clock(speed, start, length, repeat)
+    clock = _clock(played, speed, start, repeat=repeat)
     stage = _Stage(file, played, clock, coloured=bands == "rgb")
     names = file.cameras()
     if not names:
@@ -141,29 +140,30 @@ def gltf_parts(
 
     The bounding box of the first pose is centred, its longest side becomes `size` [m], and `pose` [4, 4] places it.
     The `animation` of this name plays again and again at `speed`, from `start` [s] on; without a name nothing moves.
-    Cameras and lights are left out. Colours, errors and warnings are as of `read_gltf`.
+    Cameras and lights are left out. Colours, errors and the warning are as of `read_gltf`.
     """
     document = unpacked(open_document(Path(path), UNDERSTOOD))
     file = _File(document)
     played = {} if animation is None else file.played(animation)
-    length = max((float(track.times[-1]) for track in played.values()), default=0.0)
-    clock = Clock(speed, start, length, repeat=True)
+    clock = _clock(played, speed, start, repeat=True)
     coloured = bands == "rgb"
     as_stored = _Stage(file, played, clock, coloured)
     if not as_stored.has_materials():
         return ()
     corners = np.concatenate([in_first_pose(body) for body in as_stored.bodies()])
-    low = corners.min(axis=0)
-    high = corners.max(axis=0)
-    longest = float((high - low).max())
-    if not longest > 0:
-        raise ValueError(f"{path}: all its vertices lie in one point")
-    scale = size / longest
-    centred = pose_matrix(scale * np.eye(3), -scale * (low + high) / 2)
+    _, centred = centring(document, corners, size)
     stage = _Stage(file, played, clock, coloured, centred if pose is None else pose @ centred)
     bodies = tuple(stage.bodies())
+    if any(PUNCTUAL in node.get("extensions", {}) for node in file.nodes):
+        stage.tell("the lights of a file that is shown without its own camera are left out")
     stage.warn()
     return bodies
+
+
+def _clock(played: Tracks, speed: float, start: float, *, repeat: bool) -> Clock:
+    """Return the clock of tracks; they are as long as the longest."""
+    length = max((float(track.times[-1]) for track in played.values()), default=0.0)
+    return Clock(speed, start, length, repeat)
 
 
 def in_first_pose(body: Body) -> np.ndarray:
@@ -314,7 +314,7 @@ class _Stage:
         """Yield the primitives of a node, repeated for each of its instances."""
         nodes = self._file.nodes
         found = pieces_of_node(
-            self._document, i, nodes, self._tracks or _STILL, self._joints, self._joint_of, self._paints
+            self._document, i, nodes, self._tracks or _STILL, self._joints, self._joint_of, self._paints, self.tell
         )
         copies = nodes[i].get("extensions", {}).get(INSTANCES)
         if copies is None:

@@ -13,6 +13,7 @@ from qsim.dataset.scene_rendering import load_scene
 from qsim.rendering.render_settings import RenderSettings
 from qsim.scene import MetallicRoughness, Still, animated_file
 from qsim.scene.animated.gltf_scene import gltf_parts
+from qsim.scene.shapes import mesh_file
 from qsim.scenes import asset_folder, gltf_file
 
 METAL = {
@@ -97,3 +98,18 @@ def test_files_without_a_material_are_drawn_as_before(tmp_path: Path):
     assert scenes.load(path, 1).bodies[2].name == "bend"
     scene = asset_folder.scene(1, folder=tmp_path)
     assert not any(", part " in body.name for body in scene.bodies)
+
+
+def test_lines_and_lights_that_are_left_out_are_named(tmp_path: Path):
+    file = two_parts()
+    line = {"POSITION": file.add([[0.0, 0, 0], [1, 0, 0]])}
+    file.content["meshes"].append({"primitives": [{"attributes": line, "mode": 1}]})
+    file.content["nodes"].append({"mesh": len(file.content["meshes"]) - 1})
+    file.content["nodes"].append({"extensions": {"KHR_lights_punctual": {"light": 0}}})
+    for scene in file.content.get("scenes", []):
+        scene["nodes"] += [len(file.content["nodes"]) - 2, len(file.content["nodes"]) - 1]
+    path = file.write(tmp_path / "two.glb")
+    with pytest.warns(UserWarning, match=r"primitives\[0\]: points or lines are left out; the lights of a file"):
+        assert len(gltf_parts(path, 0.1)) == 2
+    with pytest.warns(UserWarning, match="points or lines are left out"):
+        mesh_file(path)
