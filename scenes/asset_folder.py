@@ -20,7 +20,6 @@ from qsim import files
 from qsim.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture, Translation
 from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
 from qsim.scene.animated.gltf_scene import gltf_parts
-from qsim.scene.motion import Motion
 from qsim.scene.rotation import pose_matrix, vector
 from qsim.scene.shapes import MESH_SUFFIXES, mesh_file, mesh_material, moved
 from qsim.scene.textures import PICTURE_SUFFIXES
@@ -49,15 +48,12 @@ def scene(seed: int = 0, *, speed: float = 1.0, folder: str | Path, bands: Liter
     kept: list[Body] = []  # with the materials of their files
     for i, place in enumerate(tumble.spread(rng, int(rng.integers(6, 10)))):
         motion = tumble.thrown(rng, place, speed)
-        path, size = _chosen(rng, meshes)
-        solid = None if path is not None else moved(tumble.shape(rng), pose_matrix(2.5 * np.eye(3)))
+        shape = (pick(rng, meshes), between(rng, 0.08, 0.16)) if meshes else _solid(rng)
         drawn = _material(rng, pictures)
-        if path is not None and path.suffix.lower() in GLTF_SUFFIXES:
-            parts = gltf_parts(path, size, bands=bands)
-            kept += [replace(part, name=f"body {i}, part {k}", motion=motion) for k, part in enumerate(parts)]
-            if parts:
-                continue
-        bodies.append(_body(f"body {i}", solid, path, size, drawn, motion))
+        parts = () if isinstance(shape, Mesh) else _parts(*shape, bands)
+        kept += [replace(part, name=f"body {i}, part {k}", motion=motion) for k, part in enumerate(parts)]
+        if not parts:
+            bodies.append(Body(f"body {i}", *_surfaced(shape, drawn), motion))
     flight = None if seed % 3 == 0 else _flight(rng, speed)
     view = common.camera((0.0, between(rng, 0.02, 0.14), 0.65), (0, 0, 0), 0.5, flight)
     made = Scene(Path(folder).resolve().name, seed, view, (_light(rng, environments),), tuple(bodies), speed)
@@ -75,20 +71,23 @@ def assets(folder: str | Path) -> tuple[list[Path], list[Path], list[Path]]:
     return meshes, pictures, environments
 
 
-def _chosen(rng: np.random.Generator, meshes: list[Path]) -> tuple[Path | None, float]:
-    """Return a mesh of the folder, None without any, and how long it becomes: 8 to 16 cm."""
-    if not meshes:
-        return None, 0.0
-    return pick(rng, meshes), between(rng, 0.08, 0.16)
+def _solid(rng: np.random.Generator) -> Mesh:
+    """Return a solid, 8 to 16 cm across."""
+    return moved(tumble.shape(rng), pose_matrix(2.5 * np.eye(3)))
 
 
-def _body(name: str, solid: Mesh | None, path: Path | None, size: float, drawn: Material, motion: Motion) -> Body:
-    """Return a solid, or a mesh of the folder with its own colours, if any, in the finish that was drawn."""
-    if solid is not None:
-        return Body(name, solid, drawn, motion)
-    assert path is not None
+def _parts(path: Path, size: float, bands: Literal["rgb"] | None) -> tuple[Body, ...]:
+    """Return a mesh of the folder with its own materials; none unless it is a glTF file that states some."""
+    return gltf_parts(path, size, bands=bands) if path.suffix.lower() in GLTF_SUFFIXES else ()
+
+
+def _surfaced(shape: Mesh | tuple[Path, float], drawn: Material) -> tuple[Mesh, Material]:
+    """Return a solid, or a mesh of the folder and its length, with its own colours, if any, in the drawn finish."""
+    if isinstance(shape, Mesh):
+        return shape, drawn
+    path, size = shape
     own = mesh_material(path)
-    return Body(name, mesh_file(path, size=size), drawn if own is None else common.finished(own, drawn), motion)
+    return mesh_file(path, size=size), drawn if own is None else common.finished(own, drawn)
 
 
 def _flight(rng: np.random.Generator, speed: float) -> Translation:
