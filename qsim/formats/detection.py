@@ -64,7 +64,7 @@ ASSUMED: dict[str, tuple[str, str]] = {
     "cube": ("msb", "upright"),  # np.packbits along rows, row 0 on top: so photoncube shows it
     "codes": (_WHOLE, "upright"),  # row 0 on top, as arrays are shown
     "light": (_WHOLE, "upright"),  # the same
-    "video": (_WHOLE, "upright"),  # decoders give the top row first; a rotation tag is not applied
+    "video": (_WHOLE, "upright"),  # decoders give the top row first; video.py turns as the display matrix states
     "png": ("msb if 1-bit", "upright"),  # by the standard: leftmost pixel in the high bit, top row first
     "tiff": ("msb if 1-bit", "upright"),  # tifffile undoes FillOrder; an Orientation tag is not applied
     "visionsim": ("msb", "upright"),  # np.packbits along rows of pictures as rendered

@@ -1,6 +1,7 @@
 """Tests video: lossless grey is exact, and colour follows the standard in its file."""
 
 import json
+import struct
 from fractions import Fraction
 from pathlib import Path
 
@@ -31,6 +32,36 @@ def test_lossless_video_is_bit_exact_and_ordinary_video_is_not(tmp_path: Path):
     difference = np.rint(everything(lossy, transfer="linear") * 255) - code_levels(codes, 7)
     assert np.abs(difference).max() > 8
     assert json.loads((tmp_path / "exact.mp4.json").read_text())["frame_rate"] == 1000.0
+
+
+def turned(content: bytes, matrix: tuple[int, int, int, int]) -> bytes:
+    """Return the bytes of an mp4 with another display matrix in the header of its track (tkhd of version 0)."""
+    a, b, c, d = (65536 * part for part in matrix)
+    start = content.index(b"tkhd") + 44
+    return content[:start] + struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30) + content[start + 36 :]
+
+
+@pytest.mark.parametrize("quarter", range(4))
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_video_is_shown_as_its_display_matrix_says(tmp_path: Path, capsys, quarter: int, mirrored: bool):
+    """A phone held upright stores its picture on the side; stored (x, y) is shown at (a x + c y, b x + d y)."""
+    pytest.importorskip("av")
+    pytest.importorskip("cv2")
+    cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
+    sign = -1 if mirrored else 1
+    matrix = (sign * cos, sign * sin, -sin, cos)
+    stored = np.random.default_rng(1).integers(0, 256, (3, 16, 24), dtype=np.uint8)
+    write_video(tmp_path / "s.mp4", iter(stored), 30, lossless=True)
+    (tmp_path / "t.mp4").write_bytes(turned((tmp_path / "s.mp4").read_bytes(), matrix))
+    y, x = np.indices((16, 24))
+    right = matrix[0] * x + matrix[2] * y
+    down = matrix[1] * x + matrix[3] * y
+    expected = np.empty((3, np.ptp(down) + 1, np.ptp(right) + 1), np.uint8)
+    expected[:, down - down.min(), right - right.min()] = stored
+    np.testing.assert_array_equal(np.rint(everything(tmp_path / "t.mp4", transfer="linear") * 255), expected)
+    assert main(f"convert {tmp_path}/t.mp4 {tmp_path}/c --rate 60 --frame-rate 30 --transfer linear".split()) == 0
+    assert Clip.open(tmp_path / "c").shape[1:] == expected.shape[1:]
+    assert ("turned as its display matrix states" in "".join(capsys.readouterr())) == (matrix != (1, 0, 0, 1))
 
 
 def test_odd_sizes_of_video(tmp_path: Path):
