@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
+import shlex
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass, replace
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 from qsim.checks import ArgumentError
-from qsim.cli.setting_options import parameter_of, record_of, records_of
+from qsim.cli.setting_options import option_names, parameter_of, record_of, records_of
 from qsim.settings import Setting, setting, settings_of
 
 _ARGUMENT = re.compile(r"(?P<call>\b\w+\([^()]*\))|\b(?P<name>[a-z_]+)=(?P<value>'[^']*'|[^\s,;:)`]*)")
@@ -46,7 +47,7 @@ class Command:
     run: Callable[..., int]
     examples: tuple[str, ...]
     after_interrupt: str  # what the same command does after Ctrl-C
-    own: tuple[Setting, ...]  # in the order of the help
+    own: tuple[Setting, ...]  # in the order of the help: the commonest first
     idle: tuple[Idle, ...] = ()
     limits_threads: bool = False  # --threads is for the compiled engine
 
@@ -97,7 +98,8 @@ def command(
 ) -> Callable[[Callable[..., int]], Callable[..., Any]]:
     """Return a decorator that declares a function of records as a command with these examples of its use.
 
-    With `threads`, the help of the option, the command has --threads. `idle` is the table of what cannot act together.
+    The help lists the options by their number of examples. With `threads`, the help of the option, the command has
+    --threads. `idle` is the table of what cannot act together.
     """
 
     def declared(run: Callable[..., int]) -> Callable[..., Any]:
@@ -105,7 +107,7 @@ def command(
         if threads:
             (limit,) = settings_of(_threads_of(threads))
             own.append(limit)
-        made = Command(run, examples, after_interrupt, tuple(own), tuple(idle), bool(threads))
+        made = Command(run, examples, after_interrupt, commonest_first(own, examples), tuple(idle), bool(threads))
 
         def invoke(*_: Any, **__: Any) -> Command:
             return made
@@ -117,6 +119,20 @@ def command(
         return invoke
 
     return declared
+
+
+def commonest_first(settings: Iterable[Setting], examples: Iterable[str]) -> tuple[Setting, ...]:
+    """Return the settings by how many examples use them, then by their first use; the others stay in order."""
+    lines = [shlex.split(example, comments=True) for example in examples]
+    words = [word for line in lines for word in line]
+
+    def place(one: Setting) -> tuple[int, int]:
+        names = () if one.positional else option_names(one)
+        uses = sum(any(name in line for name in names) for line in lines)
+        first = min((words.index(name) for name in names if name in words), default=len(words))
+        return -uses, first
+
+    return tuple(sorted(settings, key=place))
 
 
 def _threads_of(words: str) -> Any:
