@@ -306,7 +306,7 @@ def test_readme_and_changelog_are_short():
     assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 40
 
 
-WRITTEN = ("evidence.md", "million.md", "log.md")  # by programs, and the laboratory book
+WRITTEN = ("million.md", "log.md")  # by programs, and the laboratory book
 
 
 PROSE = [path for path in sorted((ROOT / "docs").glob("*.md")) if path.name not in WRITTEN]
