@@ -38,7 +38,8 @@ VALIDATIONS = {
 HEAD = """# How do we know it is right?
 
 Every approximate number is compared with an exact one, and every speed is shown with its error. A correct
-program meets all bounds: exact forms to rounding, statistics with one false alarm in a million reports.
+program meets all bounds: exact forms to rounding, statistics with one false alarm
+in a million reports ([terms](glossary.md)).
 """
 
 MAKING = """*Made by `python benchmarks/evidence.py` from `qsim validate`; run that for the numbers of your machine.

@@ -328,6 +328,48 @@ def test_prose_can_be_read(page: Path):
     assert [each for each in sentences if len(each.split()) > 25] == []
 
 
+OUR_WORDS = r"\b(plane|code|white|matched|cell|clip|stream)s?\b"
+LOOKED_UP = {"README.md", "api.md", "architecture.md", "errors.md", "examples.md", "glossary.md", "gpu.md", "howto.md"}
+LOOKED_UP |= {
+    "index.md",
+    "limits.md",
+    "promises.md",
+    "qsim.md",
+    "quiver.md",
+    "recipes.md",
+    "reference.md",
+    "results.md",
+}
+LOOKED_UP |= {
+    "defects.md",
+    "release.md",
+    "tutorials.md",
+    "explanation.md",
+    "million.md",
+    "log.md",
+}  # menus, references, developers' pages
+READ = [path for path in sorted((ROOT / "docs").glob("*.md")) if path.name not in LOOKED_UP]
+
+
+@pytest.mark.parametrize("page", READ, ids=lambda page: page.name)
+def test_a_page_that_uses_our_words_links_the_glossary(page: Path):
+    text = page.read_text(encoding="utf-8")
+    words = re.sub(r"^```.*?^```|`[^`]*`", "", text, flags=re.MULTILINE | re.DOTALL)
+    if re.search(OUR_WORDS, words):
+        assert "](glossary.md" in text
+
+
+RETIRED = r"\b(?:(?:is|are) (?:told|refused)|without a word|of before|as of now)\b"
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_prose_has_no_retired_words(page: Path):
+    text = page.read_text(encoding="utf-8")
+    for left_out in NO_PROSE:
+        text = re.sub(left_out, "\n", text, flags=re.MULTILINE | re.DOTALL)
+    assert re.findall(RETIRED, " ".join(text.split())) == []
+
+
 def test_files_named_on_the_page_of_the_architecture_exist():
     """Full paths, and names after one of them."""
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
