@@ -430,7 +430,8 @@ def stored(clip: Clip, name: str, planes: int | None = None) -> tuple[Codes, Cod
     asked = PlaneSums(planes=planes)
     stream = clip.stream(name)
     truth = summing.summed(stream, asked).code_truth
-    if stream.info.planes_of or stream.shape != (len(stream.code_truth), *clip.shape[1:]):
+    summed_elsewhere = bool(stream.info.planes_of) and clip.info.grouped is None  # a study groups its clip alike
+    if summed_elsewhere or stream.shape != (len(stream.code_truth), *clip.shape[1:]):
         raise ValueError(f"{stream.path}: its codes are not those of its clip, so their truth is not known")
     return summed(stream_codes(stream), asked), truth
 

@@ -14,10 +14,13 @@ from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
+from qsim.streams.clip import Clip
 from qsim.streams.sensing import Sensing
 from qsim.streams.storing import sense
+from qsim.studies.bit_depth.clips import write_streams
+from qsim.studies.bit_depth.readout import StudySettings
 from quiver.data.clips import open_clips
-from quiver.data.codes import array_codes, filled, frame_reader, light_of, sensed
+from quiver.data.codes import array_codes, filled, frame_reader, light_of, sensed, stored
 from quiver.data.illumination import Illumination
 from quiver.data.windows import as_input
 
@@ -41,6 +44,21 @@ def test_sensed_codes_and_truth(make_clip: ClipMaker):
     assert truth.video().mean() == pytest.approx(3.25, rel=1e-6)
     assert codes.white == pytest.approx(8.75)
     assert (sensed(clip, Illumination(), seed=3)[0].read(0, 1) != whole[:1]).any()
+
+
+def test_planes_that_a_study_summed_have_the_truth_of_its_clip(make_clip: ClipMaker, tmp_path):
+    """Codes of the study's clip are scored; the same codes beside the planes that they sum are not."""
+    clip = make_clip("fast", frames=14, frame_rate=20000.0, exposure=5e-5)
+    (path,) = write_streams(clip, tmp_path, StudySettings(bits=(3,), ppp=0.65))
+    grouped = Clip.open(path)
+    codes, truth = stored(grouped, "planes")
+    assert codes.shape == (2, *clip.shape[1:])
+    np.testing.assert_array_equal(truth.sharp(1), grouped.stream("planes").truth(1, 2)[0])
+    (clip.path / "streams").mkdir(exist_ok=True)
+    for name in ("planes.npy", "planes.json"):
+        (clip.path / "streams" / name).write_bytes((path / "streams" / name).read_bytes())
+    with pytest.raises(ValueError, match=r"planes\.npy: "):
+        stored(Clip.open(clip.path), "planes")
 
 
 @pytest.mark.parametrize("table", ["afterpulse = 0.3\nafterpulse_delay = 1e-5\n", "carry_dead_time = true\n"])
