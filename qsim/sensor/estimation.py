@@ -302,11 +302,13 @@ def _root(function: Callable[[Array, Array], Array], low: Array, high: Array, ro
     which = np.arange(len(rows))
     f_low = bounded(low, which)
     f_high = bounded(high, which)
-    low, high = np.where(f_high >= 0, high, low), np.where(f_low <= 0, low, high)
-    open_ = low < high
-    result = low.copy()
+    # A function that keeps its sign has its zero outside: the bracket closes to its nearer end, and none is searched.
+    first = np.where(f_high >= 0, high, low)
+    last = np.where(f_low <= 0, low, high)
+    open_ = first < last
+    result = first.copy()
     if open_.any():
         tolerances = {"xrtol": 1e-13, "xatol": 0.0, "frtol": 0.0, "fatol": 0.0}
-        bracket = (low[open_], high[open_])
+        bracket = (first[open_], last[open_])
         result[open_] = find_root(bounded, bracket, args=(which[open_],), tolerances=tolerances, maxiter=_STEPS).x
     return result

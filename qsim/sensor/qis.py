@@ -439,14 +439,16 @@ def log_normal_difference(low: Array, high: Array) -> Array:
     """Return log(Phi(high) - Phi(low)), broadcast, for low <= high, without cancellation on either side of 0."""
     from scipy.special import erf, log_ndtr
 
-    flip = low > 0  # Phi(b) - Phi(a) = Phi(-a) - Phi(-b): work on the side where both are small
-    low, high = np.where(flip, -high, low), np.where(flip, -low, high)
+    # Above 0 both values of Phi are near 1 and cancel. Phi(b) - Phi(a) = Phi(-a) - Phi(-b) moves them below 0.
+    flip = low > 0
+    start = np.where(flip, -high, low)
+    end = np.where(flip, -low, high)
     with np.errstate(divide="ignore", invalid="ignore"):
-        a = log_ndtr(low)
-        b = log_ndtr(high)
+        a = log_ndtr(start)
+        b = log_ndtr(end)
         one_side = b + np.log1p(-np.exp(a - b))
-        astride = np.log((erf(high / np.sqrt(2)) + erf(-low / np.sqrt(2))) / 2)
-    return np.where(low == high, -inf, np.where(high > 0, astride, one_side))
+        astride = np.log((erf(end / np.sqrt(2)) + erf(-start / np.sqrt(2))) / 2)
+    return np.where(start == end, -inf, np.where(end > 0, astride, one_side))
 
 
 def _in_blocks(function: Callable[[Array, Array], Array], codes: Array, mean: Array) -> Array:

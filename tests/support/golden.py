@@ -130,7 +130,12 @@ def weights_by_table(
                 state[name] = state[kind.removeprefix("same tensor as ")]
                 continue
             shape = tuple(int(side) for side in size.split("x")) if size not in ("", "scalar", "()") else ()
-            fill = rest[0] if rest else "const" if kind == "buffer" else "bias" if len(shape) == 1 else "fan0.8"
+            if rest:
+                fill = rest[0]
+            elif kind == "buffer":
+                fill = "const"
+            else:
+                fill = "bias" if len(shape) == 1 else "fan0.8"
             if fill != "const":
                 value = np.asarray(fill_value(name, shape, fill, prefix, start or {}))
                 state[name] = torch.from_numpy(value).to(dtype)

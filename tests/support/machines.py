@@ -61,8 +61,9 @@ def standard_errors(values: Any, low: Any, high: Any) -> Array:
     values, low, high = (np.asarray(v, float) for v in (values, low, high))
     below = values - low
     above = high - values
-    below, above = np.where(np.isfinite(below), below, above), np.where(np.isfinite(above), above, below)
-    return np.where(np.isfinite(below), below + above, 0.0) / INTERVAL
+    lower = np.where(np.isfinite(below), below, above)
+    upper = np.where(np.isfinite(above), above, below)
+    return np.where(np.isfinite(lower), lower + upper, 0.0) / INTERVAL
 
 
 @dataclass(frozen=True)

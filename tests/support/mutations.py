@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 WRONG = ({"a": 1}, [[[]]], True, "\0", math.nan, math.inf, -1, 10**40, None)
@@ -14,7 +14,11 @@ def places(values: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str 
     """Yield the path of every value in plain values, tables and lists included."""
     if path:
         yield path
-    inner = values.items() if isinstance(values, dict) else enumerate(values) if isinstance(values, list) else ()
+    inner: Iterable[tuple[str | int, Any]] = ()
+    if isinstance(values, dict):
+        inner = values.items()
+    elif isinstance(values, list):
+        inner = enumerate(values)
     for key, value in inner:
         yield from places(value, (*path, key))
 

@@ -31,7 +31,8 @@ def sdt_bytes(images: np.ndarray) -> bytes:
     found = header.tobytes() + info + measured.tobytes()
     for i, image in enumerate(images):
         at = first + i * (block.nbytes + size)
-        block["data_offs"], block["next_block_offs"] = at + block.nbytes, at + block.nbytes + size
+        block["data_offs"] = at + block.nbytes
+        block["next_block_offs"] = at + block.nbytes + size
         block["block_length"] = size
         found += block.tobytes() + image.astype("<u2").tobytes()
     return found

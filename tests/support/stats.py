@@ -31,7 +31,10 @@ def assert_mean(
     sigma = sqrt(variance / sample.size)
     found = float(np.mean(sample, dtype=np.float64))
     limit = critical_z(false_alarm, checks)
-    z = (found - mean) / sigma if sigma > 0 else (0.0 if found == mean else np.inf)
+    if sigma > 0:
+        z = (found - mean) / sigma
+    else:
+        z = 0.0 if found == mean else np.inf
     assert abs(z) < limit, f"mean {found:.8g}, expected {mean:.8g} +- {sigma:.2g}: z = {z:.1f}, limit {limit:.1f}"
 
 

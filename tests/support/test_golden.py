@@ -114,7 +114,10 @@ def write_table(network: torch.nn.Module, path: Path) -> Path:
     parameters = dict(network.named_parameters())
     rows = []
     for name, value in network.state_dict().items():
-        fill = "fan0.8" if value.ndim > 1 else "one" if name.endswith("running_var") else "bias"
+        if value.ndim > 1:
+            fill = "fan0.8"
+        else:
+            fill = "one" if name.endswith("running_var") else "bias"
         if name not in parameters and not name.endswith(("running_mean", "running_var")):
             fill = "const"
         rows.append("\t".join((name, "x".join(map(str, value.shape)), "parameter", fill)))

@@ -111,7 +111,15 @@ def philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
     for _ in range(ROUNDS):
         a = u32(MULTIPLIERS[0])
         b = u32(MULTIPLIERS[1])
-        c0, c1, c2, c3 = dr.mul_hi(b, c2) ^ c1 ^ high, b * c2, dr.mul_hi(a, c0) ^ c3 ^ low, a * c0
+        # One round of Philox 4x32 (Salmon et al., SC 2011): two products of 64 bits, whose high halves are mixed.
+        high_a = dr.mul_hi(a, c0)
+        low_a = a * c0
+        high_b = dr.mul_hi(b, c2)
+        low_b = b * c2
+        c0 = high_b ^ c1 ^ high
+        c1 = low_b
+        c2 = high_a ^ c3 ^ low
+        c3 = low_a
         high = high + KEY_STEPS[0]
         low = low + KEY_STEPS[1]
     return [c0, c1, c2, c3]

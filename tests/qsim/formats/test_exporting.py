@@ -63,7 +63,11 @@ def test_codes_through_our_stream_and_every_export(tmp_path: Path, bits: int, wi
 
 def said(kind: str, bits: int, width: int) -> dict[str, int]:
     """What has to be said to read an export of codes again: a hint that says nothing is refused."""
-    return {"width": width} if kind == "cube" else {} if kind == "png" and bits == 1 else {"bits": bits}
+    if kind == "cube":
+        return {"width": width}
+    if kind == "png" and bits == 1:
+        return {}
+    return {"bits": bits}
 
 
 @settings(max_examples=30, deadline=None)

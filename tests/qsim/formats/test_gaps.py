@@ -66,7 +66,8 @@ def test_lost_pictures_are_told_and_kept_as_missing(tmp_path: Path):
         missing = t in (3, 4, 5)
         assert kept.saturated(t).all() == missing
         assert kept.saturated(t).any() == missing
-        grey = 0 if missing else 10 + (t if t < 3 else t - 3)
+        found = t if t < 3 else t - 3  # the file of this instant
+        grey = 0 if missing else 10 + found
         np.testing.assert_allclose(kept.radiance(t), grey / 255, rtol=1e-3)
     assert "no pixel reaches it" in importing.saturation_line(kept)
     with pytest.raises(ValueError, match="streams of codes hold no missing frames"):

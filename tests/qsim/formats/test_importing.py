@@ -219,7 +219,10 @@ def test_saturated_pixels_are_counted_marked_and_reported(
     else:
         source = source / "a.npy"
         np.save(source, shown.astype(np.float32 if kind == "floats" else np.uint16))
-    level = [] if white is None else ["--white", str(white / 255 if kind == "floats" else white)]
+    shown_white = white
+    if white is not None and kind == "floats":
+        shown_white = white / 255
+    level = [] if white is None else ["--white", str(shown_white)]
     line = [
         "convert",
         str(source),
@@ -242,7 +245,7 @@ def test_saturated_pixels_are_counted_marked_and_reported(
         assert "saturation not known" in said
         mask = np.zeros_like(mask)
     else:
-        assert f"white {white / 255 if kind == 'floats' else white:g}: " in said if white else "assumed: " in said
+        assert (f"white {shown_white:g}: " if white else "assumed: ") in said
         assert f"{100 * mask.mean():.3g} % of pixels saturated" in said
     found = np.stack([clip.saturated(t) for t in range(3)])
     np.testing.assert_array_equal(found, mask[..., ::-1])

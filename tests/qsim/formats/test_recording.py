@@ -196,12 +196,15 @@ def sample(folder: Path, layout: str) -> tuple[Path, Hints]:
     return path, Hints(layout, **({"transfer": "linear"} if light else needed.get(layout, {})))
 
 
+ORDERS = {"highest": "msb", "lowest": "lsb"}
+
+
 def promised() -> dict[str, tuple[str, str]]:
     """(bit order, orientation) of every layout, in the words of the readers, from the table in docs/files.md."""
     text = (Path(__file__).parents[3] / "docs" / "files.md").read_text(encoding="utf-8")
     found = {}
     for names, _, bits, rows in re.findall(r"^\| (`.*?) \| (.*?) \| ?(.*?) \| (.*?) \|$", text, re.MULTILINE):
-        order = "msb" if "highest" in bits else "lsb" if "lowest" in bits else "none"
+        order = next((order for word, order in ORDERS.items() if word in bits), "none")
         for name in re.findall(r"`([\w-]+)`", names):
             found[name] = order, rows.removesuffix(", rows padded").removesuffix(": `--flip lr`")
     return found

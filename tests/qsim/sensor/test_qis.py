@@ -98,7 +98,8 @@ GRID = list(product((1, 3, 5, 7), (0.0, 0.05, 0.2, 1.0, 5.1), (0.135, 0.3590, 1.
 def test_probabilities_agree_with_the_oracle_everywhere(bits, read_noise, gain, well):
     """The grid of bits, read noise, gain and full well; of 7 bits every ninth code."""
     sensor = QIS(0.8, 1.6, read_noise, bits, gain, full_well=well)
-    levels = sorted({*range(0, sensor.levels, 1 if bits < 5 else 3 if bits == 5 else 9), sensor.levels - 1})
+    step = {5: 3, 7: 9}.get(bits, 1)
+    levels = sorted({*range(0, sensor.levels, step), sensor.levels - 1})
     errors = largest_errors(sensor, LIGHT, levels)
     assert np.all(np.array(errors) < (1e-10, 1e-8, 1e-8)), errors
 
