@@ -11,11 +11,14 @@ The sections show stored results only; nothing is recomputed.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qsim import files, opening
 from qsim.report import html as page
+from qsim.report import stored_results
+from qsim.report.stored_results import EvaluatedMethod, Evaluation, EvaluationPlan, Interval
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -60,10 +63,10 @@ _SUFFIXES = (
 
 def training_section(path: Path) -> page.Section:
     """Return the learning curve: PSNR of the validation clips against minutes, with the weights that were kept."""
-    history = files.read_json(path)["history"]
+    history = stored_results.read(path, stored_results.TrainingHistory)["history"]
     name = path.parent.name
     steps = f"{history[-1]['step']} steps in {history[-1]['elapsed'] / 60:.1f} minutes"
-    known = [(entry["elapsed"] / 60, entry["psnr_matched"]) for entry in history if _is_number(entry["psnr_matched"])]
+    known = [(entry["elapsed"] / 60, entry["psnr_matched"]) for entry in history if entry["psnr_matched"] is not None]
     if not known:
         story = f"Training in the folder {name} has no finite score on the validation clips."
         return page.section(f"Training: {name}", page.text(f"{steps}; no validation has a finite score."), story=story)
@@ -78,7 +81,7 @@ def training_section(path: Path) -> page.Section:
     story = f"Training in the folder {name} reached {reached}."
     story += _drop_after(scores[best], last)
     words = f"{steps}. The weights of the best validation are kept ({scores[best]:.2f} dB); the last one has " + (
-        f"{last:.2f} dB." if _is_number(last) else "no finite score."
+        "no finite score." if last is None else f"{last:.2f} dB."
     )
     facts = [page.Fact(f"{scores[best]:.2f} dB", f"best validation of {name}")]
     return page.section(f"Training: {name}", save(words), story=story, facts=facts)
@@ -95,7 +98,7 @@ def _drop_after(best: float, last: float | None) -> str:
 
 def evaluation_section(path: Path) -> page.Section:
     """Return the scores of methods: means and 95 % intervals over scenes, the best matched PSNR of each light bold."""
-    found = files.read_json(path)
+    found = stored_results.read(path, Evaluation)
     rows = [
         [
             line["method"],
@@ -149,7 +152,7 @@ def evaluation_section(path: Path) -> page.Section:
     return page.section(f"Methods compared: {path.parent.name}", *parts, story=story, facts=facts)
 
 
-def _winner(lines: list[dict[str, Any]], plan: dict[str, Any]) -> str:
+def _winner(lines: list[EvaluatedMethod], plan: EvaluationPlan) -> str:
     """Return a sentence with the best method of each light level, given their lines; empty without any."""
     if not lines:
         return ""
@@ -160,7 +163,7 @@ def _winner(lines: list[dict[str, Any]], plan: dict[str, Any]) -> str:
     return f"{start} best matched PSNR is {', '.join(best)}."
 
 
-def _definition(found: dict[str, Any]) -> str:
+def _definition(found: Evaluation) -> str:
     """Return the definition of the scores of an evaluation."""
     unit = "window" if found.get("plan", {}).get("published") else "clip"
     return (
@@ -168,7 +171,7 @@ def _definition(found: dict[str, Any]) -> str:
     )
 
 
-def _near(line: dict[str, Any], name: str) -> str:
+def _near(line: EvaluatedMethod, name: str) -> str:
     return " †" if name in line.get("near_truth", ()) else ""
 
 
@@ -176,13 +179,13 @@ def _percent(share: object) -> str | None:
     return f"{100 * share:.1f} %" if isinstance(share, int | float) else None
 
 
-def _score(line: dict[str, Any], name: str, digits: int) -> str:
+def _score(line: EvaluatedMethod, name: str, digits: int) -> str:
     """Return a score of a line as text; "failed" where no clip has it because the method failed."""
     found = line["scores"][name]
     return "failed" if found["mean"] is None and line.get("failures") else _pm(found, digits)
 
 
-def _pm(interval: dict[str, Any], digits: int) -> str:
+def _pm(interval: Interval, digits: int) -> str:
     """Return "23.45 ± 0.67", without the half-width if there is one scene; "inf" for the text that stands for it."""
     mean = interval["mean"]
     half = interval["half_width"]
@@ -193,10 +196,10 @@ def _pm(interval: dict[str, Any], digits: int) -> str:
 
 def static_section(path: Path) -> page.Section:
     """Return the scores on measured photons of a static object: some frames are restored, the others the reference."""
-    found = files.read_json(path)
+    found = stored_results.read(path, stored_results.StaticObject)
     headers = ["method", "PSNR [dB]", "PSNR matched [dB]", "spread over splits [dB]", "with the reference's noise [dB]"]
     keys = ("method", "psnr", "psnr_matched", "psnr_matched_spread", "psnr_as_measured")
-    rows = [[score[key] for key in keys] for score in found["scores"]]
+    rows = [[dict(score)[key] for key in keys] for score in found["scores"]]
     caption = (
         f"{Path(found['counts']).name}: real photons clipped to {found['bits']} bits, restored from {found['frames']} "
         "frames, scored against the others; the variance of the reference is subtracted; "
@@ -205,7 +208,7 @@ def static_section(path: Path) -> page.Section:
     return page.section("Real photons", page.table(page.Table(caption, headers, rows)))
 
 
-def _speed_against_error(found: dict[str, Any]) -> Markup | None:
+def _speed_against_error(found: Evaluation) -> Markup | None:
     """Return PSNR against seconds per frame, one mark per method and light level; None if no time is stored."""
     axes, save = page.axes("seconds per frame", "PSNR matched [dB]")
     lights = list(dict.fromkeys(line["light"] for line in found["table"]))
@@ -265,45 +268,63 @@ def bench_section(path: Path) -> page.Section:
 
 def validation_section(path: Path) -> page.Section:
     """Return speed against error of sensor models or of rendering, from the JSON of `qsim validate`."""
-    found = files.read_json(path)
-    verdict = "everything is within its bounds" if found["ok"] else "something is OUTSIDE its bounds"
-    if "median_ratio" in found:
-        axes, save = page.axes("seconds per frame", "PSNR against the reference [dB]")
-        for x, y, label in (("seconds", "psnr", "ours"), ("obvious_seconds", "obvious_psnr", "the naive loop")):
-            axes.plot([row[x] for row in found["rows"]], [row[y] for row in found["rows"]], "o", label=label)
-        keys = ["scene", "level", "psnr", "stated_psnr", "samples", "bounces", "seconds", "obvious_seconds", "ratio"]
-        what = f"rendering, frames of {found['height']} × {found['width']}, {found['engine']}"
-    else:
-        axes, save = page.axes("million pixels per second", "error of the cdf")
-        rows = [row for row in found["rows"] if row["cdf_error"]]
-        for engine in dict.fromkeys(row["engine"] for row in rows):
-            own = [row for row in rows if row["engine"] == engine]
-            speeds = [row["megapixels_per_second"] for row in own]
-            errors = [row["cdf_error"] for row in own]
-            axes.plot(speeds, errors, "o", label=engine)
-        axes.set_yscale("log")
-        keys = ["model", "engine", "megapixels_per_second", "times_numpy", "cdf_error"]
-        keys += ["p_value", "z_mean", "z_variance", "mismatches_per_million"]
-        what = f"sensors, {found['pixels']} pixels a draw"
+    return _of_rendering(path) if "median_ratio" in files.read_json(path) else _of_sensors(path)
+
+
+def _of_rendering(path: Path) -> page.Section:
+    found = stored_results.read(path, stored_results.RenderingValidation)
+    rows = found["rows"]
+    axes, save = page.axes("seconds per frame", "PSNR against the reference [dB]")
+    axes.plot([row["seconds"] for row in rows], [row["psnr"] for row in rows], "o", label="ours")
+    naive = [(row["obvious_seconds"], row["obvious_psnr"]) for row in rows]
+    axes.plot([x for x, _ in naive], [y for _, y in naive], "o", label="the naive loop")
     axes.set_xscale("log")
     axes.legend()
-    rows = [[row[key] for key in keys] for row in found["rows"]]
-    table = page.table(page.Table(f"{what}: {verdict}", [_heading(key) for key in keys], rows))
+    keys = ["scene", "level", "psnr", "stated_psnr", "samples", "bounces", "seconds", "obvious_seconds", "ratio"]
+    what = f"rendering, frames of {found['height']} × {found['width']}, {found['engine']}"
+    table = _validated(what, found["ok"], keys, [dict(row) for row in rows])
+    return page.section("Validation", save("speed against error"), table)
+
+
+def _of_sensors(path: Path) -> page.Section:
+    found = stored_results.read(path, stored_results.SensorValidation)
+    axes, save = page.axes("million pixels per second", "error of the cdf")
+    measured = [row for row in found["rows"] if row["cdf_error"]]
+    for engine in dict.fromkeys(row["engine"] for row in measured):
+        own = [row for row in measured if row["engine"] == engine]
+        axes.plot([row["megapixels_per_second"] for row in own], [row["cdf_error"] for row in own], "o", label=engine)
+    axes.set_yscale("log")
+    axes.set_xscale("log")
+    axes.legend()
+    keys = ["model", "engine", "megapixels_per_second", "times_numpy", "cdf_error"]
+    keys += ["p_value", "z_mean", "z_variance", "mismatches_per_million"]
+    what = f"sensors, {found['pixels']} pixels a draw"
+    table = _validated(what, found["ok"], keys, [dict(row) for row in found["rows"]])
     cases = [[case["name"], case["found"], "right" if case["ok"] else "wrong"] for case in found.get("cases", [])]
     hard = page.table(page.Table("hard cases", ["case", "found", ""], cases)) if cases else None
     return page.section("Validation", save("speed against error"), table, hard)
 
 
+def _validated(what: str, ok: bool, keys: Sequence[str], rows: Sequence[Mapping[str, object]]) -> Markup:
+    """Return the table of a validation, with its verdict."""
+    verdict = "everything is within its bounds" if ok else "something is OUTSIDE its bounds"
+    cells = [[row[key] for key in keys] for row in rows]
+    return page.table(page.Table(f"{what}: {verdict}", [_heading(key) for key in keys], cells))
+
+
 def reading_section(path: Path) -> page.Section:
     """Return the windows read per second from a clip and from video, from the JSON of `qsim validate reading`."""
-    found = files.read_json(path)
-    window, clip = (" × ".join(map(str, found[key])) for key in ("window_shape", "clip_shape"))
+    found = stored_results.read(path, stored_results.Reading)
+    window = " × ".join(map(str, found["window_shape"]))
+    clip = " × ".join(map(str, found["clip_shape"]))
     verdict = "as fast as wanted" if found["ok"] else "NOT as fast as wanted"
     what = (
         f"windows of {window} in a clip of {clip}: {verdict} ({found['wanted']:g}/s, {found['wanted_ratio']:g} times)"
     )
-    sides = (("clip folder", "clip"), ("mp4", "mp4"))
-    rows = [[name, found[side], found[f"{side}_processor"]] for name, side in sides]
+    rows = [
+        ["clip folder", found["clip"], found["clip_processor"]],
+        ["mp4", found["mp4"], found["mp4_processor"]],
+    ]
     table = page.table(page.Table(what, ["from", "windows per second", "per second of processor time"], rows))
     return page.section("Reading", table)
 

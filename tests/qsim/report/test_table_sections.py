@@ -207,3 +207,15 @@ def test_a_method_that_failed_on_some_clips_has_no_rank(tmp_path):
     lines = [scored("a", "3 PPP", None, scenes=0), scored("b", "3 PPP", None, scenes=0) | {"failures": ["c: why"]}]
     body = evaluated(tmp_path, *lines).body
     assert (body.count("n/a"), body.count("failed</td>")) == (3, 3)
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [({"step": 1, "psnr_matched": 20.0}, "key 'history[0].elapsed' is missing"), ({"step": "one"}, "history[0].step")],
+)
+def test_results_that_were_changed_are_refused_by_their_key(tmp_path, entry, words):
+    path = tmp_path / "history.json"
+    path.write_text(json.dumps({"history": [entry]}))
+    with pytest.raises(ValueError, match="make it again") as refused:
+        training_section(path)
+    assert words in str(refused.value)
