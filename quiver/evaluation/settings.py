@@ -4,15 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, TypedDict
 
 from qsim.kinds import Bits, Light, Positive, Seed, Text, Whole
 from qsim.settings import setting
 from quiver.data.illumination import sensor_names
 from quiver.restoration.settings import method_names
 
-# What a test of the paper decides: these settings cannot be given beside it.
-PROTOCOLS: dict[str, dict[str, Any]] = {
+
+class Protocol(TypedDict):
+    """What a test of the paper decides: these settings cannot be given beside it."""
+
+    split: None
+    stream: None
+    sensor: str
+    bits: tuple[int, ...]
+    planes: None
+    peak: None
+    published: bool
+
+
+PROTOCOLS: dict[str, Protocol] = {
     name: {
         "split": None,
         "stream": None,

@@ -9,7 +9,6 @@ one; otherwise the dimmest would own the gradient. Above the peak the clamp keep
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,14 +17,14 @@ from torch import Tensor, nn
 from quiver.data.codes import Codes
 from quiver.model.blocks import WINDOW
 from quiver.restoration.merge_inputs import middle_inputs
-from quiver.training.settings import Settings
+from quiver.training.settings import Protocol, Settings
 from quiver.training.system import Batch
 
 NODES = 1024  # of the table from phi to light, evenly spaced in phi
 FLOOR = 2e-6  # added to a mean squared error: 57 dB
 ABOVE = 0.05  # slope of light above the peak
 
-PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
+PROTOCOLS: Mapping[str, Protocol] = {
     "quick": {
         "sensor": ("quiver-physical", "spad-320x240"),  # of a SPAD, 2^bits - 1 planes are summed
         "ppp": tuple(float(f"{level:.3g}") for level in np.geomspace(0.3, 100, 16)),

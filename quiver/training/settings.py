@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypedDict
 
 import numpy as np
 
@@ -178,8 +178,30 @@ class Settings:
         return plain | {"noise": None if self.noise is None else [noise.to_dict() for noise in self.noise]}
 
 
-# Bundles of defaults, which options override: ours, those of the authors' program, and those of the paper's text.
-_PUBLISHED = {
+class Protocol(TypedDict, total=False):
+    """A bundle of defaults, which options override: some settings by the names and with the types of `Settings`."""
+
+    sensor: str | tuple[str, ...]
+    ppp: tuple[float, ...]
+    bits: tuple[int, ...]
+    crop: int
+    frames: int
+    batch: int
+    optimiser: Kind
+    learning_rate: float
+    schedule: Literal["cosine", "plateau"]
+    warmup: int
+    clip_norm: float
+    loss: str
+    reverse: bool
+    drift: int
+    force_exposure: bool
+    steps: int
+    precision: Literal["auto", "float32", "bfloat16"]
+
+
+# Ours, those of the authors' program, and those of the paper's text.
+_PUBLISHED: Protocol = {
     "schedule": "plateau",
     "warmup": 0,
     "crop": 128,
@@ -188,7 +210,7 @@ _PUBLISHED = {
     "bits": (3,),
     "precision": "float32",
 }
-PROTOCOLS: dict[str, dict[str, Any]] = {
+PROTOCOLS: dict[str, Protocol] = {
     "quick": {"optimiser": "muon", "learning_rate": 6e-3, "loss": "scales-l1", "drift": 3},
     "control": {"loss": "l1"},
     "published": _PUBLISHED

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from quiver.data.windows import Prepare
-from quiver.training.settings import Settings
+from quiver.training.settings import Protocol, Settings
 
 Batch = Mapping[str, Any]  # of samples from `Windows`: codes and target [B, T, 1, h, w], and what `prepare` adds
 
@@ -36,7 +36,7 @@ class System:
     name: str  # for messages
     loss: Loss
     restored: Restored  # what a validation scores
-    protocols: Mapping[str, Mapping[str, Any]]  # name -> settings that options override
+    protocols: Mapping[str, Protocol]  # name -> settings that options override
     losses: tuple[str, ...] = ("own",)  # values of Settings.loss that `loss` accepts
     frames: int = 11  # of the windows of a validation, and least of those of training
     as_long: bool = False  # validations see as many frames as training: a state that grows over them is told
@@ -95,7 +95,7 @@ class Objective(nn.Module):
         return self.loss(self.network, batch, self.settings, share)
 
 
-def protocol(system: System, name: str) -> Mapping[str, Any]:
+def protocol(system: System, name: str) -> Protocol:
     """Return the settings of a protocol; `ValueError` if the system has none of that name."""
     if name not in system.protocols:
         raise ValueError(f"protocol={name}: {system.name} has {' and '.join(system.protocols)}; choose one of them")

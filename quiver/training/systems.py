@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Unpack
 
 import torch
 from torch import Tensor, nn
@@ -27,11 +27,11 @@ from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.loss import training_loss
 from quiver.training.mosaic_training import mosaic_system
 from quiver.training.self_supervised import split_loss
-from quiver.training.settings import PROTOCOLS, Settings
+from quiver.training.settings import PROTOCOLS, Protocol, Settings
 from quiver.training.system import Batch, System
 
 # The published program trains all networks alike: these settings, unless a network states others.
-_PORT: dict[str, Any] = {
+_PORT: Protocol = {
     "sensor": "quiver-published",
     "ppp": (3.25,),
     "bits": (3,),
@@ -46,7 +46,7 @@ _PORT: dict[str, Any] = {
     "loss": "own",
     "precision": "float32",
 }
-_FASTDVDNET = {
+_FASTDVDNET: Protocol = {
     "sensor": "quiver-published",
     "ppp": (3.25,),
     "bits": (3,),
@@ -59,14 +59,16 @@ _FASTDVDNET = {
     "steps": 320_000,
     "precision": "float32",
 }
-_STREAM: dict[str, Any] = {"frames": 32, "batch": 1, "learning_rate": 2e-4, "clip_norm": 1.0, "loss": "own"}
-_QUICK: dict[str, Any] = {"learning_rate": 1e-3, "loss": "own"}
+_STREAM: Protocol = {"frames": 32, "batch": 1, "learning_rate": 2e-4, "clip_norm": 1.0, "loss": "own"}
+_QUICK: Protocol = {"learning_rate": 1e-3, "loss": "own"}
 
 
-def _protocols(published: dict[str, Any], **quick: Any) -> dict[str, dict[str, Any]]:
+def _protocols(published: Protocol, **quick: Unpack[Protocol]) -> dict[str, Protocol]:
     """Return the protocols of a compared network: our short runs, and the published program."""
-    common = {name: value for name, value in published.items() if name == "frames"}
-    return {"quick": _QUICK | common | quick, "published": _PORT | published}
+    short: Protocol = {**_QUICK, **quick}
+    if "frames" in published:
+        short.setdefault("frames", published["frames"])  # what a network is shown at once belongs to its design
+    return {"quick": short, "published": {**_PORT, **published}}
 
 
 # ---- Networks with the outside of QUIVER, and the control

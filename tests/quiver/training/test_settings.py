@@ -7,7 +7,8 @@ import math
 import pytest
 from runs import settings
 
-from quiver.training.settings import PROTOCOLS, Settings, portable
+from qsim import records
+from quiver.training.settings import PROTOCOLS, Protocol, Settings, portable
 
 
 def test_protocols_are_those_of_the_paper_and_its_program():
@@ -19,6 +20,15 @@ def test_protocols_are_those_of_the_paper_and_its_program():
     paper = Settings("d", "o", **PROTOCOLS["paper"])
     assert (paper.learning_rate, paper.batch, paper.loss, paper.sensor) == (2.5e-5, 4, "paper", "quiver-paper")
     assert Settings("d", "o", steps=1, **PROTOCOLS["spad-sum"]).lights[0].device(7e-4).white(7e-4) == 7
+
+
+def test_a_protocol_decides_settings_that_exist_as_the_settings_take_them():
+    for found in PROTOCOLS.values():
+        assert records.convert(records.plain(dict(found)), Protocol, "protocol")
+        Settings("d", "o", **{"steps": 1} | found)
+    assert set(Protocol.__annotations__) <= set(records.hints_of(Settings))
+    with pytest.raises(ValueError, match="batch"):
+        records.convert({"batch": "eight"}, Protocol, "protocol")
 
 
 def test_every_level_and_depth_is_mixed():
