@@ -20,7 +20,7 @@ import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NotRequired, TypedDict
 
 import numpy as np
 from numpy import ndarray as Array
@@ -59,13 +59,33 @@ class Sensed:
     truth: Callable[[], Array] | None  # float32 [N, H, W] or [N, 3, H, W]; None: not known
 
 
+class DescribedStream(TypedDict):
+    """A stream of a published clip: the names of its arrays, and its description."""
+
+    codes: NotRequired[str]
+    truth: NotRequired[str]
+    packed: bool  # whether codes keep their bits in bytes
+    info: dict[str, Any]  # as the stream's own file holds it; read by `descriptions`, which checks its version
+
+
+class Description(TypedDict):
+    """What a shard states of a clip beside its arrays."""
+
+    clip: str
+    split: str | None
+    frames: dict[str, list[int]]  # of fields that not all frames have
+    streams: dict[str, DescribedStream]
+    info: dict[str, Any]  # as clip.json holds it, likewise
+
+
 @dataclass(frozen=True)
 class Sample:
     """A clip as it is published."""
 
     key: str  # of all its files in a shard
     clip: Clip
-    description: dict[str, Any]  # plain values, for JSON
+    description: Description
+    streams: dict[str, StreamInfo]
     arrays: dict[str, Callable[[], Array]]  # by field, computed when they are written
 
     def picture(self) -> bytes:
@@ -139,25 +159,25 @@ def sample_of(
     every = [*streams, *(sensing.stream_name for sensing in sensings)]
     found = [stored(clip, name) for name in streams if name in clip.streams]
     found += [sensed(clip, sensing) for sensing in sensings]
-    described = {}
+    described: dict[str, DescribedStream] = {}
     for one in found:
         suffix = "" if len(every) == 1 else f"_{every.index(one.name)}"
-        own = {}
+        own: DescribedStream = {"packed": packed, "info": descriptions.values_of(one.info)}
         if "codes" in fields:
             own["codes"] = f"codes{suffix}"
             arrays[own["codes"]] = one.packed if packed else partial(_unpacked, one)
         if "truth" in fields and one.truth is not None:
             own["truth"] = f"truth{suffix}"
             arrays[own["truth"]] = one.truth
-        described[one.name] = {**own, "packed": packed, "info": descriptions.values_of(one.info)}
-    about = {
+        described[one.name] = own
+    about: Description = {
         "clip": clip.name,
         "split": split,
         "frames": frames,
         "streams": described,
         "info": descriptions.values_of(clip.info if clip.info.name else replace(clip.info, name=clip.name)),
     }
-    return Sample(key, clip, about, arrays)
+    return Sample(key, clip, about, {one.name: one.info for one in found}, arrays)
 
 
 def _frames_of(clip: Clip, field: str) -> list[int]:

@@ -17,6 +17,7 @@ from qsim.publishing.contents import Sample, png
 from qsim.publishing.record import MODULES, SetInfo
 from qsim.publishing.statistics import Statistics
 from qsim.sensor import packing
+from qsim.streams.stream_info import StreamInfo
 
 SIZES = (("n<1K", 10**3), ("1K<n<10K", 10**4), ("10K<n<100K", 10**5), ("100K<n<1M", 10**6), ("1M<n<10M", 10**7))
 FIELDS = {
@@ -195,7 +196,9 @@ def picture(sample: Sample) -> bytes:
     shown = [colour.tone_picture(radiance, colour.peak(radiance), colours=clip.bands is not None)]
     described = next(iter(sample.description["streams"].values()), None)
     if described and "codes" in described:
-        shown.append(_codes(sample.arrays[described["codes"]](), described))
+        codes = sample.arrays[described["codes"]]()
+        info = next(iter(sample.streams.values()))
+        shown.append(_codes(codes, info, packed=described["packed"]))
     if clip.has_truth and clip.info.has("truth", middle):
         there = clip.channels_of_truth(middle)
         if {"u", "v"} <= there:
@@ -209,14 +212,12 @@ def picture(sample: Sample) -> bytes:
     return png(np.kron(joined, np.ones((-(-HEIGHT // len(joined)),) * 2 + (1,), np.uint8)))
 
 
-def _codes(codes: Array, described: dict[str, object]) -> Array:
+def _codes(codes: Array, info: StreamInfo, *, packed: bool) -> Array:
     """Return the codes of the middle one as grey levels."""
-    info = described["info"]
-    assert isinstance(info, dict)
     middle = codes[len(codes) // 2]
-    if described["packed"]:
-        middle = packing.unpack(middle, info["bits"], info["shape"][2])
-    return colour.code_levels(middle, 2 ** info["bits"] - 1)
+    if packed:
+        middle = packing.unpack(middle, info.bits, info.shape[2])
+    return colour.code_levels(middle, 2**info.bits - 1)
 
 
 def _as_rgb(image: Array) -> Array:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import descriptions, files
+from qsim import descriptions, files, records
 from qsim.checks import SPLITS
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.clip_info import ClipInfo
@@ -34,7 +34,7 @@ from qsim.files import Progress
 from qsim.host import own_numbers
 from qsim.lazy_array import LazyArray
 from qsim.optics.radiometry import Crop, check_crop
-from qsim.publishing.contents import CHANNELS
+from qsim.publishing.contents import CHANNELS, DescribedStream, Description
 from qsim.publishing.located import Entry, Located
 from qsim.publishing.place import Place, is_address, place
 from qsim.publishing.record import CURE, SET, SetInfo, ShardSummary, load, read_place, reader_of
@@ -221,7 +221,7 @@ class Stored:
     entry: Entry
 
     @cached_property
-    def description(self) -> dict[str, Any]:
+    def description(self) -> Description:
         """The description of the clip."""
         path = Path(self.data.address) / self.file
         with files.decoding_errors(path, self.data.info.to):
@@ -230,7 +230,7 @@ class Stored:
         inside = found.get("attributes", {}).get("description") if self.data.info.to == "zarr" else found
         if not isinstance(inside, dict) or inside.get("clip") != self.entry.clip:
             raise ValueError(f"{self.data.address}/{self.file}: is not the shard that is described; {CURE}")
-        return inside
+        return records.convert(inside, Description, f"{path}/{self.entry.clip}: its description", cure=CURE)
 
     def frames(self, name: str, start: int, stop: int, crop: Crop | None = None) -> Array:
         """Return frames start ... stop - 1 of an array, of the rows and columns of a crop."""
@@ -319,10 +319,8 @@ class PublishedClip(Clip):
         """Open a clip at its place."""
         stored = Stored(data, shard.file, entry)
         path = Path(data.address) / shard.file / entry.clip
-        values = stored.description.get("info")
-        if not isinstance(values, dict):
-            raise ValueError(f"{path}: its description lacks info; {CURE}")
-        return PublishedClip(path, descriptions.of_values(path, values, ClipInfo, CURE), None, stored)
+        info = descriptions.of_values(path, stored.description["info"], ClipInfo, CURE)
+        return PublishedClip(path, info, None, stored)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -412,9 +410,8 @@ class PublishedStream(Stream):
         return self.of_clip
 
     @property
-    def _described(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.of_clip.stored.description["streams"][self.name]
-        return found
+    def _described(self) -> DescribedStream:
+        return self.of_clip.stored.description["streams"][self.name]
 
     @cached_property
     def packed(self) -> LazyArray:

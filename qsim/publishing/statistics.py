@@ -12,6 +12,7 @@ from qsim.clip.motion_statistics import looks, moving_mean, moving_pixels
 from qsim.kinds import Count, Digest, Number, Text
 from qsim.publishing.contents import Sample
 from qsim.streams.clip import Clip
+from qsim.streams.stream_info import StreamInfo
 
 PHOTOGRAPHS = "CC0 or public domain (a picture of the package scikit-image)"
 UNKNOWN = "not recorded: a file of the maker of this set"
@@ -93,8 +94,6 @@ def statistics_of(sample: Sample) -> Statistics:
     clip = sample.clip
     info = clip.info
     frames, height, width = clip.shape
-    described = sample.description["streams"]
-    light = {name: one["info"].get("light") for name, one in described.items()}
     return replace(
         _motion(clip),
         clips=1,
@@ -104,8 +103,8 @@ def statistics_of(sample: Sample) -> Statistics:
         rates=Spread.of(info.frame_rate),
         photons=Spread() if info.mean_photons is None else Spread.of(info.mean_photons),
         error=Spread() if info.psnr_of_truth is None else Spread.of(info.psnr_of_truth),
-        ppp={name: Spread.of(one["ppp"]) if one else Spread() for name, one in light.items()},
-        sensors={name: _sensor(one["info"]) for name, one in described.items()},
+        ppp={name: Spread.of(one.light.ppp) if one.light else Spread() for name, one in sample.streams.items()},
+        sensors={name: _sensor(one) for name, one in sample.streams.items()},
         licences=_licences(clip),
         files={Path(name).name: digest for name, digest in info.reads.items() if "*" not in name},
     )
@@ -123,12 +122,12 @@ def _motion(clip: Clip) -> Statistics:
     )
 
 
-def _sensor(info: dict[str, Any]) -> str:
+def _sensor(info: StreamInfo) -> str:
     """Return the sensor of a stream as text: name, model and bits."""
-    model = str(info["sensor"].get("model", "sensor"))
-    name = info.get("sensor_name") or model
-    defects = ", with defects" if info.get("defects") else ""
-    return f"{Path(name).name} ({model}, {info['bits']} bit{'s' * (info['bits'] > 1)}{defects})"
+    model = str(info.sensor.get("model", "sensor"))
+    name = info.sensor_name or model
+    defects = ", with defects" if info.defects else ""
+    return f"{Path(name).name} ({model}, {info.bits} bit{'s' * (info.bits > 1)}{defects})"
 
 
 def _licences(clip: Clip) -> dict[str, str]:
