@@ -258,7 +258,7 @@ def _toml(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
-def as_dict(found: Calibration) -> dict[str, Any]:
+def as_dict(found: Calibration) -> dict[str, object]:
     """Return values, warnings, goodness and hot pixels for JSON; ends that are open or missing become null."""
     return {
         "model": found.model,
@@ -273,7 +273,7 @@ def _json(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _hot_pixels(found: Calibration) -> dict[str, Any]:
+def _hot_pixels(found: Calibration) -> dict[str, object]:
     """Return the places and dark rates [1/s] of the hot pixels, row by row; nothing without a map of them."""
     if "hot_pixels" not in found.maps:
         return {}

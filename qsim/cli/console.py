@@ -260,7 +260,7 @@ def one_line(error: BaseException) -> str:
     return wording(error)
 
 
-def output(found: dict[str, Any], text: str | Sequence[str]) -> None:
+def output(found: Mapping[str, object], text: str | Sequence[str]) -> None:
     """Print the result of the command: JSON with --json, else text."""
     if running().printing.json:
         print(json.dumps(found, sort_keys=True))

@@ -303,7 +303,7 @@ def check(asked: Check) -> int:
             with bar(f"{path} again", "stream") as progress:
                 again += checking.redraw(path, progress, asked.shard)
     names = ", ".join(str(path) for path in asked.paths)
-    facts: dict[str, Any] = {"paths": [str(path) for path in asked.paths], "problems": problems}
+    facts: dict[str, object] = {"paths": [str(path) for path in asked.paths], "problems": problems}
     lines = checking.lines(problems, names)
     if asked.redraw:
         facts["redrawn"] = [dataclasses.asdict(one) | {"path": str(one.path), "wrong": one.wrong} for one in again]

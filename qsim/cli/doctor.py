@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from qsim.cli.command import command
 from qsim.cli.console import INSTALLED_AS, OPTIONAL, output
 from qsim.settings import setting
+
+if TYPE_CHECKING:
+    from qsim.sensor.devices import ListedDevice
 
 
 @dataclass(frozen=True)
@@ -55,8 +58,8 @@ def _extra_text(extra: str, missing: list[str]) -> str:
     return f"MISSING (pip install {' '.join(names)}); for {purpose}" if missing else f"installed; for {purpose}"
 
 
-def _device_text(device: dict[str, Any]) -> str:
+def _device_text(device: ListedDevice) -> str:
     lines = [f"{device['name']}: {device['what']}"]
-    lines += [f"    {key}: {value}" for key, value in device.items() if key not in ("name", "what", "sources")]
-    lines += [f"    {key}, source: {text}" for key, text in dict(device.get("sources", {})).items()]
+    lines += [f"    settings: {device['settings']}", f"    settings_at: {device['settings_at']}"]
+    lines += [f"    {key}, source: {text}" for key, text in device["sources"].items()]
     return "\n".join(lines)

@@ -109,7 +109,7 @@ def _line(made: dict[str, Any]) -> str:
     return f"{begun} {made['file']}: {kind}, {made['rates']}; {made['light']}"
 
 
-def _light(info: StreamInfo) -> dict[str, Any]:
+def _light(info: StreamInfo) -> dict[str, object]:
     """Return what `--json` states of a stream that was drawn."""
     assert info.light is not None
     levels = {"ppp": info.light.ppp, "ppp_factor": info.light.factor, "mean_photons_before": info.light.before}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -268,7 +268,7 @@ def _check_colour(asked: Tradeoff) -> None:
 class _Done:
     """What a study found: numbers, pictures by name, lines of its table, and its answers."""
 
-    result: dict[str, Any]
+    result: dict[str, object]
     pictures: dict[str, Any]
     text: list[str]
     answers: list[str]
@@ -355,7 +355,7 @@ def _motion(name: str, shape: Any, speed: float) -> float:
     return scene_motion(name, size, frames=shape.frames, frame_rate=rate, seed=shape.seed, speed=speed)
 
 
-def _write_study(folder: Path, name: str, result: dict[str, Any], pictures: dict[str, bytes]) -> list[str]:
+def _write_study(folder: Path, name: str, result: Mapping[str, object], pictures: dict[str, bytes]) -> list[str]:
     folder.mkdir(parents=True, exist_ok=True)
     for picture, content in pictures.items():
         files.write_bytes(folder / picture, content)

@@ -9,7 +9,7 @@ Fields that hold their default are not written. A key that no field has is refus
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
@@ -185,7 +185,7 @@ class ClipInfo(Measured, Origin):
         return (self.source.orientation if self.source is not None else "") or "upright"
 
     @property
-    def asked(self) -> dict[str, Any]:
+    def asked(self) -> dict[str, object]:
         """The description without what is measured, as plain values: equal for clips of equal frames."""
         measured = {field.name for field in fields(Measured)}
         return {name: value for name, value in records.plain(self).items() if name not in measured}

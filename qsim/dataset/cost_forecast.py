@@ -118,7 +118,7 @@ class Forecast:
         """Return the size of everything [GB]."""
         return sum(cost.gigabytes for cost in self.costs)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the forecast for --json."""
         rows = []
         for cost in self.costs:

@@ -10,7 +10,7 @@ import itertools
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import overload
 
 from qsim.dataset.job import Job
 from qsim.dataset.series import Listing, Series, short_seeds
@@ -46,7 +46,7 @@ class Jobs(Sequence[Job]):
 
     def __init__(self, sections: Iterable[JobSeries], chosen: tuple[range, ...] | None = None) -> None:
         self.sections = tuple(sections)
-        self._names = Listing([replace(_UNREAD, **_named(each)) for each in self.sections])
+        self._names = Listing([_unread(each) for each in self.sections])
         self.chosen = (range(len(self._names)),) if chosen is None else chosen
         self._starts = [0, *itertools.accumulate(map(len, self.chosen))]
 
@@ -122,13 +122,14 @@ class Jobs(Sequence[Job]):
         return sum(len(part) * part[0].settings.frames for part in self.by_section())
 
 
-_UNREAD = Series(stem="x", seeds=0, split="train", digest="0" * 64)
+_NO_DIGEST = "0" * 64
 
 
-def _named(section: JobSeries) -> dict[str, Any]:
-    """Return what the names of a section's clips follow from."""
+def _unread(section: JobSeries) -> Series:
+    """Return what the names of a section's clips follow from; the files that decide its digest are not read."""
     job = section.example
-    return {"stem": job.stem, "seeds": short_seeds(section.seeds), "speeds": section.speeds, "split": job.split}
+    seeds = short_seeds(section.seeds)
+    return Series(stem=job.stem, seeds=seeds, speeds=section.speeds, split=job.split, digest=_NO_DIGEST)
 
 
 def _within(piece: range, start: int, stop: int) -> range:

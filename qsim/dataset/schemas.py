@@ -36,13 +36,13 @@ class OtherTables:
     colour: ColourKeys | None = None
 
 
-def of_recipes() -> dict[str, Any]:
+def of_recipes() -> dict[str, object]:
     """Return the JSON Schema of a recipe."""
     found = msgspec.json.schema(RecipeFile)
     return {"$schema": _DIALECT, "title": "A recipe of qsim"} | _closed(found)
 
 
-def of_sensor_files() -> dict[str, Any]:
+def of_sensor_files() -> dict[str, object]:
     """Return the JSON Schema of a sensor file: [sensor] has the keys of one model, and those of every model."""
     tables = [_table_of(name) for name in MODELS]
     (*models, others), definitions = msgspec.json.schema_components(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -334,7 +334,9 @@ def write_cube(path: Path, blocks: Iterator[Array], shape: tuple[int, int, int])
             file.write(packing.pack(block, 1).tobytes())
 
 
-def write_zarr(folder: Path, blocks: Iterator[Array], shape: tuple[int, int, int], attributes: dict[str, Any]) -> None:
+def write_zarr(
+    folder: Path, blocks: Iterator[Array], shape: tuple[int, int, int], attributes: Mapping[str, object]
+) -> None:
     """Write a zarr v3 group with `frames` [T, H, W] in chunks of full frames, as quanta-spad-sim stores them."""
     import zarr
 

@@ -174,7 +174,7 @@ def _nerfstudio(source: Any, path: Path, wanted: Export, info: ExportInfo) -> Ex
     return info
 
 
-def camera_file(clip: Clip) -> dict[str, Any]:
+def camera_file(clip: Clip) -> dict[str, object]:
     """Return the content of a transforms.json of a clip: its camera, and a pose per frame named 000000.png and so on.
 
     `ValueError` for a clip without a camera, and with less than two frames.

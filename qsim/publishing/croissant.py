@@ -7,7 +7,6 @@ other formats are not known to it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from qsim.publishing import data_card, parquet_shards
 from qsim.publishing.record import MODULES, SetInfo
@@ -19,7 +18,7 @@ ENCODINGS = {
     "hdf5": "application/x-hdf5",
     "zarr": "application/zip",
 }
-CONTEXT: dict[str, Any] = {
+CONTEXT: dict[str, object] = {
     "@language": "en",
     "@vocab": "https://schema.org/",
     "citeAs": "cr:citeAs",
@@ -59,13 +58,13 @@ CONTEXT: dict[str, Any] = {
 }
 
 
-def metadata(info: SetInfo, totals: Mapping[str, Statistics]) -> dict[str, Any]:
+def metadata(info: SetInfo, totals: Mapping[str, Statistics]) -> dict[str, object]:
     """Return the metadata of a set, plain values for JSON."""
     shards = [shard for listed in info.shards.values() for shard in listed]
     clips = sum(shard.clips for shard in shards)
     whole = sum(totals.values(), Statistics())
     counts = ", ".join(f"{found.clips} {split}" for split, found in totals.items())
-    files: list[dict[str, Any]] = [
+    files: list[dict[str, object]] = [
         {
             "@type": "cr:FileObject",
             "@id": shard.file,
@@ -77,7 +76,7 @@ def metadata(info: SetInfo, totals: Mapping[str, Statistics]) -> dict[str, Any]:
         }
         for shard in shards
     ]
-    found: dict[str, Any] = {
+    found: dict[str, object] = {
         "@context": CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
@@ -104,7 +103,7 @@ def _sensors(totals: Mapping[str, Statistics]) -> list[str]:
     return list(dict.fromkeys(sensor for found in totals.values() for sensor in found.sensors.values()))
 
 
-def _shards_as_one(info: SetInfo) -> dict[str, Any]:
+def _shards_as_one(info: SetInfo) -> dict[str, object]:
     """Return the set of all Parquet files."""
     return {
         "@type": "cr:FileSet",
@@ -115,7 +114,7 @@ def _shards_as_one(info: SetInfo) -> dict[str, Any]:
     }
 
 
-def _records(info: SetInfo) -> dict[str, Any]:
+def _records(info: SetInfo) -> dict[str, object]:
     """Return the columns of a set in Parquet."""
     texts = dict.fromkeys(parquet_shards.TEXTS, "sc:Text")
     types = texts | dict.fromkeys(info.columns, "sc:Text")

@@ -80,7 +80,7 @@ def schema(columns: Sequence[str]) -> Any:
     picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
     types = [*((name, pa.string()) for name in TEXTS), ("picture", picture)]
     types += [(name, pa.large_binary()) for name in columns]
-    features: dict[str, Any] = {name: {"dtype": "string", "_type": "Value"} for name in TEXTS}
+    features: dict[str, object] = {name: {"dtype": "string", "_type": "Value"} for name in TEXTS}
     features["picture"] = {"_type": "Image"}
     features |= {name: {"dtype": "large_binary", "_type": "Value"} for name in columns}
     note = json.dumps({"info": {"features": features}})

@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 from dataclasses import dataclass
 from math import ceil, sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,12 +101,12 @@ def explore_page(clip: Clip) -> str:
     )
 
 
-def named_sensors(exposure: float, ppp: float = 3.25) -> list[dict[str, Any]]:
+def named_sensors(exposure: float, ppp: float = 3.25) -> list[dict[str, object]]:
     """Return the devices that the sliders can state, at this exposure [s] and light: {name, what, settings, follows}.
 
     `follows` holds light and frames per code of the settings where these follow them, else None.
     """
-    found = []
+    found: list[dict[str, object]] = []
     for device in devices.DEVICES.values():
         if device.bits > BITS:
             continue

@@ -8,10 +8,9 @@ Nothing is computed from these pictures. A terminal shows two pixels per charact
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,13 +82,14 @@ def _caption(view: View, width: int) -> Picture:
 
 
 def write(
-    path: Path, page: Sheet, frames: range, fps: float, about: dict[str, Any], progress: Progress | None = None
+    path: Path, page: Sheet, frames: range, fps: float, about: Mapping[str, object], progress: Progress | None = None
 ) -> None:
     """Write PNG (the first of `frames`), GIF or mp4 by the suffix of `path`, and a sidecar with `about` and the scales.
 
     Both appear together.
     """
-    declared = {"format": "qsim-preview-1", "curve": CURVE, "views": [declaration(view) for view in page.views]}
+    views = [declaration(view) for view in page.views]
+    declared: dict[str, object] = {"format": "qsim-preview-1", "curve": CURVE, "views": views}
     drawn = _drawn(page, frames, progress)
     with files.replacing_together(path, sidecar(path)) as (made, described):
         if path.suffix == ".png":
@@ -100,7 +100,7 @@ def write(
             from qsim.formats.video import write_video
 
             write_video(made, drawn, fps, lossless=False)
-        files.write_json(described, declared | about)
+        files.write_json(described, {**declared, **about})
 
 
 def sidecar(path: Path) -> Path:
@@ -115,7 +115,7 @@ def _drawn(page: Sheet, frames: range, progress: Progress | None) -> Iterator[Pi
             progress(n, len(frames))
 
 
-def _write_png(path: Path, picture: Picture, declared: dict[str, Any]) -> None:
+def _write_png(path: Path, picture: Picture, declared: Mapping[str, object]) -> None:
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 

@@ -325,6 +325,6 @@ def choose(source: Source, wanted: list[str] | None, *, several: bool = True) ->
     return [source.views[kind] for kind in wanted]
 
 
-def declaration(view: View) -> dict[str, Any]:
+def declaration(view: View) -> dict[str, object]:
     """Return kind, declaration and scale of a view, for JSON."""
-    return {"what": view.kind, "declared": view.declared} | view.scale
+    return {"what": view.kind, "declared": view.declared, **view.scale}

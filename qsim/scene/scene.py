@@ -230,7 +230,7 @@ class Scene:
         """Return the same scene with another number of pixels."""
         return replace(self, camera=self.camera.resized(height, width))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the scene as JSON-ready values; arrays become their shape, type and SHA-256."""
         described = describe(self)
         assert isinstance(described, dict)

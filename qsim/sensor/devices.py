@@ -29,6 +29,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import TypedDict
 
 from qsim import files, plugins
 from qsim.checks import ArgumentError, file_path, suggest
@@ -479,9 +480,19 @@ def check_known(sensor: Sensor) -> None:
         )
 
 
-def listing() -> list[dict[str, object]]:
-    """Return all named sensors as records: name, what, model, settings at 3.25 PPP, sources."""
-    rows: list[dict[str, object]] = []
+class ListedDevice(TypedDict):
+    """A named sensor as `qsim doctor --devices` states it."""
+
+    name: str
+    what: str
+    settings: dict[str, object]  # its record at 3.25 PPP
+    settings_at: str  # the light to which they belong
+    sources: dict[str, str]  # of its numbers
+
+
+def listing() -> list[ListedDevice]:
+    """Return all named sensors."""
+    rows: list[ListedDevice] = []
     for device in DEVICES.values():
         settings = device.make(3.25, device.bits, 5e-4).to_dict()
         rows.append(

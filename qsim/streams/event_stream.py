@@ -59,7 +59,7 @@ class EventInfo:
         records.settle(self)
 
     @property
-    def compared(self) -> dict[str, Any]:
+    def compared(self) -> dict[str, object]:
         """What makes these events others than asked for: equal for equal events."""
         found = records.plain(self)
         for name in ("events", "brighter", "following", "sha256", "software", "orientation"):

@@ -81,7 +81,7 @@ class StreamInfo:
         return None if self.clip_key is None else self.sensing.seed
 
     @property
-    def compared(self) -> dict[str, Any]:
+    def compared(self) -> dict[str, object]:
         """What makes a stream another one than asked for: equal for streams of equal codes.
 
         Folders of files do not count: sensor files have their name alone, and measured maps their checksums. Nor do the

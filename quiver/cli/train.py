@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from qsim.checks import ArgumentError
 from qsim.cli.command import command
@@ -25,6 +25,9 @@ from quiver.device import DEVICES
 from quiver.model.names import QUIVERS
 from quiver.restoration.interface import RestoreOptions
 from quiver.training.settings import PROTOCOLS, Settings
+
+if TYPE_CHECKING:
+    from quiver.training.schedule import State
 
 DIVERGED = 3  # exit code of a run whose loss became NaN or infinite
 
@@ -118,7 +121,7 @@ def settings_of_run(bundle: str, given: Mapping[str, Any]) -> Settings:
     from quiver.training.system import protocol
     from quiver.training.systems import system_named
 
-    defaults = dict(protocol(system_named(given.get("network", Settings.network)), bundle))
+    defaults: dict[str, Any] = dict(protocol(system_named(given.get("network", Settings.network)), bundle))
     if any(sensor.endswith(".toml") for sensor in given.get("sensor", ())):
         defaults.pop("bits", None)  # a sensor file states its own; a named sensor beside it has those of the streams
     if "planes" in given:
@@ -177,10 +180,10 @@ def _signals(found: list[int]) -> AbstractContextManager[None]:
     return handling(lambda number, _: found.append(number), signal.SIGINT, *ENDING)
 
 
-def _summary(folder: Path, state: Any) -> tuple[dict[str, Any], str]:
+def _summary(folder: Path, state: State) -> tuple[dict[str, object], str]:
     from quiver.evaluation.json_values import json_safe
 
-    found = {"run": str(folder), "steps": state.step, "seconds": state.elapsed}
+    found: dict[str, object] = {"run": str(folder), "steps": state.step, "seconds": state.elapsed}
     text = f"{folder}: {state.step} steps in {state.elapsed / 60:.1f} min"
     weights = str(folder / "best.safetensors")
     if state.history:

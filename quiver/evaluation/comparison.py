@@ -66,7 +66,7 @@ class Comparison:
             return self.stream if self.planes is None else f"{self.stream}, {self.planes} planes"
         return labels(self.lights)[light]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, for JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return {name: v for name, v in plain.items() if v is not None or name not in ("test_set", "planes")}
@@ -299,7 +299,7 @@ def in_memory(codes: Codes) -> Codes:
     return replace(codes, read=array_codes(codes.read(0, codes.shape[0]), codes.sensor, codes.exposure).read)
 
 
-def content_of(comparison: Comparison, clips: Sequence[Clip]) -> dict[str, Any]:
+def content_of(comparison: Comparison, clips: Sequence[Clip]) -> dict[str, object]:
     """Return the SHA-256 of the scored content: the descriptions of clips and stored stream, and the sensor files."""
     name = comparison.stream
     described = [

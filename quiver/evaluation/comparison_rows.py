@@ -50,7 +50,7 @@ class ComparisonRow:
         settings = json.dumps([self.description, self.precision, self.cut])
         return f"{self.method} {hashlib.sha256(settings.encode()).hexdigest()[:8]}"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON: null for NaN, and the texts inf and -inf."""
         return json_safe(asdict(self), infinite=True)
 

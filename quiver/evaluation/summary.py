@@ -259,7 +259,7 @@ def _per_scene(rows: Sequence[ComparisonRow]) -> list[str]:
 
 def as_dict(
     comparison: Comparison, methods: Sequence[Restorer], rows: Sequence[ComparisonRow], remarks: Sequence[str] = ()
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the complete evaluation for programs."""
     found: dict[str, Any] = json_safe(
         {

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 
 @dataclass(frozen=True)
@@ -15,7 +14,7 @@ class Preset:
     """A network by name."""
 
     home: str  # module:class in quiver.model; the module has the configuration, too
-    settings: Mapping[str, Any] = field(default_factory=dict)  # of the configuration that are not at their defaults
+    settings: Mapping[str, object] = field(default_factory=dict)  # of the configuration that are not at their defaults
 
     @property
     def compared(self) -> bool:
@@ -38,7 +37,7 @@ _PUBLISHED = {
     "spk2imgnet": Preset("rivals.spk2imgnet:Spk2ImgNet"),
 }
 # As their ports have them; the others are mended, with the sensor's noise or factor.
-_AS_PUBLISHED: dict[str, dict[str, Any]] = {
+_AS_PUBLISHED: dict[str, dict[str, object]] = {
     "emvd": {},
     "flornn": {},
     "memdeblur": {"group_norm": False},
@@ -47,7 +46,7 @@ _AS_PUBLISHED: dict[str, dict[str, Any]] = {
 # Sizes at which all networks cost alike: about a million multiply-accumulates per pixel and frame. Each is its
 # published design with other widths. Counted by `quiver.evaluation.macs.design_macs`: one more frame of a long clip,
 # whose ends do not count.
-_EQUAL_COST: dict[str, dict[str, Any]] = {
+_EQUAL_COST: dict[str, dict[str, object]] = {
     # 1.02 M; the published width 16 costs 2.5
     "quiver-s": {"channels": 12, "deformable_groups": 12, "denoiser_growth": 24, "flow_channels": (16, 32, 16, 8)},
     "mergenet": {"width": 110},  # 0.99 M; merging, before it, has no convolutions

@@ -125,7 +125,7 @@ class Domain:
         """Return the text for the metadata of a weights file."""
         return json.dumps(self.to_dict(), sort_keys=True)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, for JSON."""
         return {"format": FORMAT, "measured": dict(self.measured), "cells": [asdict(cell) for cell in self.cells]}
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -32,7 +31,7 @@ class Sweep:
     predicted: dict[str, Array]  # model -> bits of the highest PSNR by the law, [len(speeds), len(ppps)]
     loss: dict[str, Array]  # dB by which the law's depth is worse than the simulated best, the same shape
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the sweep for JSON."""
         cells = []
         for i, speed in enumerate(self.speeds):
@@ -76,7 +75,7 @@ class Sweep:
         }
 
 
-def study_dict(found: Study) -> dict[str, Any]:
+def study_dict(found: Study) -> dict[str, object]:
     """Return a study for JSON: rows, light, structure function."""
     result = {key: value for key, value in vars(found).items() if key not in ("rows", "structure")}
     result["rows"] = [asdict(row) for row in found.rows]

@@ -18,7 +18,6 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from statistics import median
-from typing import Any
 
 import numpy as np
 
@@ -67,7 +66,7 @@ class BackendReport:
         """Whether all means agree."""
         return all(row.deviation(self.reference(row)) <= DEVIATIONS for row in self.rows)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the report for JSON."""
         rows = []
         for row in self.rows:

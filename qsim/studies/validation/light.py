@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -68,7 +67,7 @@ class LightReport:
         """Whether all rows are within their bounds."""
         return all(row.ok for row in self.rows)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the report for JSON."""
         return asdict(self) | {"rows": [asdict(row) | {"ok": row.ok} for row in self.rows], "ok": self.ok}
 

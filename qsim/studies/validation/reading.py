@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -57,7 +56,7 @@ class ReadingReport:
         """Whether both speeds are reached, and both readers read the same pictures."""
         return self.clip >= WANTED and self.ratio >= RATIO and self.difference < 0.05
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the report for JSON."""
         sizes = {"window_shape": [WINDOW, CROP, CROP], "clip_shape": [FRAMES, HEIGHT, WIDTH]}
         return asdict(self) | sizes | {"ratio": self.ratio, "wanted": WANTED, "wanted_ratio": RATIO, "ok": self.ok}

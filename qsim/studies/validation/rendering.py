@@ -20,7 +20,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -85,7 +84,7 @@ class RenderRow:
         """Processor seconds of the naive loop divided by ours."""
         return self.naive_processor / self.processor
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the row for JSON, where the fields of the naive loop begin with "obvious_", as in stored files."""
         fields = {name.replace("naive_", "obvious_"): value for name, value in asdict(self).items()}
         return fields | {"ratio": self.ratio, "processor_ratio": self.processor_ratio}
@@ -112,7 +111,7 @@ class RenderReport:
         """Whether the median scene at AT_LEVEL reaches WANTED_RATIO, and no scene is slower."""
         return self.median_ratio >= WANTED_RATIO and all(row.ratio >= 1 for row in self.rows)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the report for JSON."""
         rows = [row.to_dict() for row in self.rows]
         return asdict(self) | {"rows": rows, "median_ratio": self.median_ratio, "ok": self.ok}

@@ -10,7 +10,7 @@ report, compiled codes to 5 in a million.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from math import expm1, log1p, sqrt
@@ -78,14 +78,14 @@ class SensorReport:
     rows: list[SensorRow]
     cases: list[Case]
     pixels: int
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def ok(self) -> bool:
         """Whether every number is within its bounds and every hard case is right."""
         return not any(row.wrong for row in self.rows) and all(case.ok for case in self.cases)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the report for JSON."""
         return asdict(self) | {"ok": self.ok}
 
