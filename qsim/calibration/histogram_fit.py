@@ -79,6 +79,7 @@ class Likelihood:
 
     def _panels(self, start: Array) -> list[Panel]:
         """Return one panel of all dim cells, and those of the bright ones: one per stack."""
+        # Bins are as fine as the law has structure: a part of the read noise, or of a bright cell's spread.
         step = exp(start[GAIN] + start[NOISE]) / FINEST
         electrons = self.means(start)
         rest = [i for i in range(len(self.cells)) if i not in self.simple]
@@ -143,6 +144,8 @@ class Likelihood:
         most = max((float(electrons[list(panel.cells)].max()) for panel in self.panels), default=0.0)
         found = []
         for change in BESIDE:
+            # A comb of single electrons fits nearly as well with one tooth more or
+            # less: such gains are maxima of their own, and each is tried.
             factor = 1 + change / max(most, 4.0)
             other = parameters.copy()
             other[GAIN] -= log(factor)
@@ -206,6 +209,7 @@ class Likelihood:
             slope = self.slopes(panel, law, parameters)
             value += float(np.sum(panel.counts * np.log(law.shares)))
             weight = panel.counts.sum(axis=1)[:, None] / law.shares
+            # Fisher's information of a multinomial law: n sum over the bins of dp_b / dq dp_b / dr / p_b.
             fisher = np.einsum("qrb,prb->qpr", slope * weight, slope, optimize=True)
             add(np.array(panel.cells), np.einsum("qrb,rb->qr", slope, panel.counts / law.shares), fisher)
         if self.simple.size:
@@ -246,9 +250,12 @@ class Likelihood:
     def _step(self, state: State, hold: Array | None, damping: float) -> tuple[float, State, float]:
         """Return the gain in log likelihood of one step, the state after it, and the damping of the next."""
         low = self.bounds(state.parameters)
+        # A parameter at its bound that would leave it does not move (active set).
         free = ~((state.parameters <= low) & (state.score <= 0)) & (np.diag(state.information) > 0)
         if hold is not None:
             free |= hold != 0  # a held parameter does not move alone
+        # Parameters have other units and sizes: scaled to an information of
+        # 1, one damping serves all (Levenberg and Marquardt).
         scale = 1 / np.sqrt(np.maximum(np.diag(state.information)[free], 1e-12))
         matrix = state.information[np.ix_(free, free)] * np.outer(scale, scale)
         push = state.score[free] * scale
@@ -258,6 +265,8 @@ class Likelihood:
             solved = np.linalg.solve(damped, push)
             if normal is not None:
                 along = np.linalg.solve(damped, normal)
+                # Lagrange: the part of the step that would change the held sum is
+                # taken back along the direction that costs least.
                 solved = solved - along * (normal @ solved) / (normal @ along)
             step = np.zeros(self.size)
             step[free] = scale * solved
@@ -289,6 +298,8 @@ class Likelihood:
                 tables = slope[:, r]
                 terms = np.stack([table[bins].sum(axis=0) for table in tables])
                 if not self.dark[i]:
+                    # The spread of light within a cell is itself measured from
+                    # its pixels, and each has an influence on it.
                     terms += by_excess[:, r, None] * (cell.influence / cell.influence.size)
                     pushes[cell.pixels, self.own[i]] += terms[SHARED]
                 pushes[cell.pixels, :SHARED] += terms[:SHARED].T
@@ -304,6 +315,8 @@ class Likelihood:
         scale = 1 / np.sqrt(np.maximum(np.diag(state.information), 1e-300))
         matrix = state.information * np.outer(scale, scale)
         inverse = np.linalg.pinv(matrix, rcond=1e-12, hermitian=True) * np.outer(scale, scale)
+        # The sandwich (Huber, 1967): covariance of the score by pixels, between two inverse
+        # informations. It holds though the frames of a pixel are not independent.
         meat = pushes.T @ pushes * (pixels / max(pixels - self.size, 1))
         return inverse, inverse @ meat @ inverse
 

@@ -147,6 +147,8 @@ class _Array:
         everywhere = np.ones_like(self.hot)
         found = _distribution(dark, everywhere)
         hot = hot_by_rate(dark.counts, found.median * dark.time) | dark.saturated
+        # Hot pixels disturb the law of rates, and the law decides which
+        # pixels are hot: once more without what they light.
         lit = self._lit_by_hot(dark, hot, found.median * dark.time)
         if lit.any() and not lit.all():
             found = _distribution(dark, ~lit)
@@ -187,6 +189,7 @@ class _Array:
             change = quantity(moved) - base
             moves += [change, -change]
         for move in moves:
+            # Independent causes add in squares, on each side for itself: intervals need not be symmetric.
             down += np.minimum(move, 0) ** 2
             up += np.maximum(move, 0) ** 2
         return down, up
@@ -248,6 +251,7 @@ def _distribution(dark: DarkRates, kept: Array) -> Distribution:
     limit = 10 * max(float(np.median(dark.counts[kept])), 1.0) + 10
     bulk = (dark.counts <= limit) & kept
     counts = float(dark.counts[bulk].sum())
+    # 1 for Poisson counts; correlated avalanches make it larger, saturation smaller.
     spread = float((dark.variance[bulk] * dark.time**2).sum()) / counts if counts > 0 else 1.0
     return distribution(Counts(dark.counts[kept], dark.time, max(spread, 0.05), dark.saturated[kept]))
 
@@ -315,6 +319,8 @@ def _near_saturation(dark: DarkRates, near: Array, response: Response) -> tuple[
     ):
         here = response.at(exposure)
         most = most_counts(here)
+        # The counts that a nearly saturated pixel misses are rare: their
+        # exact interval is Garwood's (1936), by chi-square.
         fewest = chi2_quantile(0.025, 2 * missing) / 2 if missing > 0 else 0.0
         largest = chi2_quantile(0.975, 2 * max(missing, 0) + 2) / 2
         arrivals, codes = here.table(most)
@@ -389,6 +395,7 @@ def _efficiency(array: _Array) -> tuple[dict[str, Value], list[str]]:
     weights /= weights.sum()
     value = float(weights @ base)
     if len(used) > 1:  # flats that scatter by more than their noise: the lamp was not steady
+        # Birge's ratio: errors are scaled up where the numbers scatter more than they should, never down.
         scatter = float((base - value) @ np.linalg.solve(errors, base - value)) / (len(used) - 1)
         covariance = covariance * max(scatter, 1.0)
     down, up = array.reach(lambda response: np.array([weights @ slopes(response)]), np.array([value]))
@@ -407,6 +414,7 @@ def _mean_light(flat: FrameStatistics, dark: DarkRates | None, good: Array, resp
     light, variance = light_of(flat, dark, response)
     mean = float(light[good].mean())
     noise = float(variance[good].sum()) / good.sum() ** 2
+    # Pixels that are left out are lit all the same; without them a shaded corner would move the mean.
     missing = int((~good).sum())
     if missing == 0:
         return mean, noise
@@ -459,6 +467,7 @@ def _goodness(array: _Array) -> tuple[float, tuple[Array, ...]]:
         here = array.response.at(flat.exposure)
         mean = float(flat.total[good].mean()) / flat.frames
         arrivals = float(matched_variance(np.array([mean]), here).arrivals[0])
+        # Gauss-Hermite quadrature over the spread of light from pixel to pixel.
         share = WEIGHTS @ here.pmf(np.maximum(arrivals * (1 + spread * NODES), 0.0))
         hot = here.of_stack(flat).value[~good]
         if hot.size:

@@ -95,6 +95,7 @@ class Camera:
 
     def _check_pose(self) -> None:
         """Raise `ValueError` for a view without an orientation, and for a focus nearer than the lens reaches."""
+        # An `up` along the view leaves the picture free to turn around it.
         forward = np.subtract(self.target, self.origin)
         if not np.linalg.norm(np.cross(forward, self.up)) > 1e-9 * np.linalg.norm(forward):
             raise ValueError(
@@ -120,6 +121,7 @@ class Camera:
         assert self.zoom is not None
         share, lens = self.zoom.at(t)
         distance = share * self.height * self.pixel_pitch
+        # The lens equation 1/f = 1/distance + 1/focus: a lens that focuses near stands farther from its pixels than f.
         focal_length = distance * self.focus / (distance + self.focus) if self.aperture_blur else distance
         return replace(self, zoom=None, focal_length=focal_length, lens=lens)
 
@@ -228,6 +230,7 @@ class Camera:
         if self.zoom is not None:
             return self.at(t).project(points, t)
         pose = self.pose(t)
+        # The transpose of a rotation is its inverse: row vectors times the pose's axes are camera coordinates.
         local = (np.asarray(points, np.float64) - pose[:3, 3]) @ pose[:3, :3]
         with np.errstate(divide="ignore", invalid="ignore"):
             slopes = local[..., :2] / local[..., 2:]

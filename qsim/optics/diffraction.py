@@ -56,6 +56,7 @@ def blurred(image: Array, camera: Camera) -> Array:
     """
     from scipy import fft
 
+    # A cosine transform mirrors the image at its edges. Its k-th wave has k / 2 periods over the image.
     down, across = (np.arange(size) / (2 * size) for size in image.shape)  # cycles/px of a cosine transform
     contrast = mtf(np.hypot(down[:, None], across * camera.aspect), camera)
     spectrum = fft.dctn(plain(image, np.float64), norm="ortho")
@@ -78,6 +79,8 @@ def diffract(image: Array, camera: Camera) -> Array:
     from scipy import ndimage
 
     light = np.maximum(light, 0.0)
+    # The lack of a pixel is shared out over its square in proportion to the light there. The
+    # filter twice gives each pixel the sum of what all lacks around take from it.
     around = ndimage.uniform_filter(light, NEAR, mode="constant")
     share = np.divide(lack, around, out=np.zeros_like(lack), where=(lack > 0) & (around > 0))
     taken = ndimage.uniform_filter(share, NEAR, mode="constant")

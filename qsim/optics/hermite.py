@@ -26,6 +26,7 @@ def value_at(times: Sequence[float], values: Array, t: float) -> Array:
     i, s, length = interval(times, t)
     p = values
     m = slopes(times, values) * length
+    # The cubic Hermite basis h00, h10, h01, h11 at the fraction s of the interval.
     value: Array = (
         (2 * s**3 - 3 * s**2 + 1) * p[i]
         + (s**3 - 2 * s**2 + s) * m[i]

@@ -131,6 +131,7 @@ class Lens:
         while reach < fold and reach * float(self._least_stretch(np.array(reach))) < far:
             reach = min(1.5 * reach, fold)
         known = np.linspace(0.0, reach, KNOWN)
+        # A table gives the start, near enough for Newton's method to double its digits in every step.
         radius = np.interp(seen, known * self._least_stretch(known), known)
         for _ in range(STEPS):
             off = radius * self._least_stretch(radius) - seen
@@ -152,6 +153,8 @@ class Lens:
             across, mixed, down = self._derivative(rays)
             area = across * down - mixed**2
         else:
+            # The area of a pixel's slopes over that which is seen: stretch
+            # along the circle times stretch along the radius.
             area = 1 + self.k1 * square + self.k2 * square**2 + self.k3 * square**3 + self.k4 * square**4
             rise = 1 + 3 * self.k1 * square + 5 * self.k2 * square**2 + 7 * self.k3 * square**3
             area = area * (rise + 9 * self.k4 * square**4)
@@ -179,6 +182,7 @@ class Lens:
                     f"Camera.lens: with {stated} the picture folds at {limit:.4g} focal lengths from the axis, and its "
                     f"corner is at {corner:.4g}; use weaker distortion or a longer lens"
                 )
+        # The falloff is least at the axis, at the corner, or where its polynomial turns between them.
         far = float(self.traced_radius(np.array([corner]))[0]) ** 2
         shares = np.polynomial.Polynomial([1.0, *self.falloff])
         turns = [float(root.real) for root in shares.deriv().roots() if 0 < float(root.real) < far]
@@ -213,6 +217,8 @@ class Lens:
         square = np.sum(slopes**2, axis=-1)[..., None]
         pull = np.array([self.p2, self.p1])
         along = np.sum(slopes * pull, axis=-1)[..., None]
+        # Brown (1966), as OpenCV has it: x (1 + k1 r^2 + ...) + 2 p1 x y +
+        # p2 (r^2 + 2 x^2), and y with p1 and p2 exchanged.
         bent: Array = slopes * (self._stretch(np.sqrt(square)) + 2 * along) + square * pull
         return bent
 
@@ -240,6 +246,7 @@ class Lens:
         for _ in range(TANGENTIAL_STEPS):
             across, mixed, down = self._derivative(found)
             area = across * down - mixed**2
+            # Newton's step: the inverse of a symmetric 2 x 2 matrix times what is off.
             step = np.stack([down * off[..., 0] - mixed * off[..., 1], across * off[..., 1] - mixed * off[..., 0]], -1)
             step = step / area[..., None]
             better = np.zeros(error.shape, bool)

@@ -97,6 +97,7 @@ def to_irradiance(radiance: Array, camera: Camera, cos_theta: float | Array = 1.
 
     `radiance` is [...] in W m^-2 sr^-1; `cos_theta` is a number or broadcasts with it.
     """
+    # The camera equation: one cosine each for the tilted pupil and the tilted pixel, two for the longer way.
     scale = np.pi * camera.transmission / (4 * camera.working_f_number**2)
     return np.asarray(radiance, np.float64) * (scale * cos_theta**4)
 
@@ -128,6 +129,7 @@ def expected_photons(
     if (camera.vignetting or camera.lens is not None) and radiance.ndim >= 2:
         height, width = radiance.shape[-2:]
         y, x = origin or ((camera.height - height) / 2, (camera.width - width) / 2)
+        # Fall-off belongs to the place in the camera's frame, not in the crop.
         axis = height, width, camera.axis[1] - y, camera.axis[0] - x, camera.focal_pixels
         if camera.lens is not None:
             radiance = radiance * illumination(*axis, camera.lens, camera.vignetting)
@@ -145,6 +147,7 @@ def band_photons(
     `radiance` [..., 3, H, W] holds the power of each band, whose light has one wavelength of `bands` [m].
     """
     cameras = [replace(camera, wavelength=wavelength) for wavelength in bands]
+    # A band's power is counted in photons of its own energy: red light of the same power has more of them.
     each = [expected_photons(radiance[..., i, :, :], c, exposure, origin=origin) for i, c in enumerate(cameras)]
     return np.stack(each, axis=-3)
 

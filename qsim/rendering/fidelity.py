@@ -128,6 +128,7 @@ def choose_budget(  # noqa: PLR0913 (settings of a public function)
     if blurs:
         instants, blurred, about_blur = _blur(pilot, bright, allowed, bounces)
     strict = allowed.repeated
+    # Independent errors add in squares: what bounces and blur leave of the allowed error is for the noise of samples.
     share = math.sqrt(1 - min(strict.fraction(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
     noise = Noise.of(halves, allowed.white).times(pilot.unevenness(instants))
     needed = _Work(bounces, instants, frames, share, allowed, noise)
@@ -135,6 +136,7 @@ def choose_budget(  # noqa: PLR0913 (settings of a public function)
     chosen = found.chosen
     dimmed = dimming(full, cut)
     pixels = scene.camera.height * scene.camera.width
+    # The error of the mean of all pixels, as a share of the light: that of one pixel over the root of their number.
     noisy = noise.at(chosen.samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
     findings = (
         limit,
@@ -215,6 +217,8 @@ def _planes(pilot: Pilot, sharp: Budget, work: _Work, denoise: bool | None) -> B
             chosen = Sharing(fewer[0], 0, fewer[1])
             how = f"their mean denoised, {fewer[1]} quality; {raw} without"
     each = (chosen.samples - sharp.samples) // (count - 1)
+    # The mean of a code may be right while its planes are not: a binary
+    # plane bends, and noise between planes lowers its counts.
     unbiased = each
     while planes_bias(work, unbiased, sharp.samples) > BIAS and unbiased < sharp.samples:
         unbiased = 2 * plane_grid(unbiased // 2 + 1)
@@ -224,6 +228,7 @@ def _planes(pilot: Pilot, sharp: Budget, work: _Work, denoise: bool | None) -> B
         chosen = replace(chosen, samples=each * (count - 1) + sharp.samples)
     pixels = pilot.renderer.scene.camera.height * pilot.renderer.scene.camera.width
     alone = Sharing.of(sharp).cost(pixels)
+    # A code needs a sharp frame in its middle anyway, so planes have to be cheaper together with it.
     if chosen.cost(pixels) + alone - sharp.samples >= count * alone:
         return None
     size = f"{each} samples per pixel each, {how}; that in the middle has {sharp.samples}"
@@ -273,6 +278,7 @@ def _of_code(noise: Noise, count: int, each: int, in_middle: int) -> Errors:
 
 def _beside_sharp(count: int, in_middle: int, each: float) -> int:
     """Return the samples of a code whose planes have the noise of `each` samples each, if the middle one has more."""
+    # Variances: (count - 1) / others + 1 / in_middle = count / each, solved for the samples of the others.
     left = count / each - 1 / in_middle
     others = (count - 1) / left if left > 0 else 2.0
     return (count - 1) * 2 * plane_grid(math.ceil(min(others, in_middle) / 2)) + in_middle
@@ -377,6 +383,7 @@ def allowed_in(
     text += f"; {_percent(brighter)} of the pixels are brighter, picture and truth are clamped there, as in scores"
     sensor = math.inf
     if ppp is not None:
+        # The relative shot noise of n electrons is 1 / root(n); the renderer may take SENSOR_SHARE of its variance.
         sensor = mean * math.sqrt(SENSOR_SHARE / (efficiency * ppp))
         text += f"; the sensor at {ppp:g} photons per pixel allows {sensor:.3g} without a clamp"
         text += f", {sensor / math.sqrt(planes):.3g} of errors that repeat within a code" if planes > 1 else ""
@@ -443,6 +450,7 @@ def fewest_instants(extent: Array, contrast: float, changes: Callable[[int], flo
     """
     fastest = max(map(bright_end, extent))
     runs = float((extent > 0.1).mean(axis=(1, 2)).max())
+    # Only the pixels of edges that move are wrong: their share of the frame thins out the rms error.
     edge = SHARE / max(contrast * math.sqrt(runs), 1e-300)
     count = 3
     while blur_error(fastest, count) > edge and count < MOST_INSTANTS:
@@ -506,6 +514,8 @@ def _error(errors: tuple[float, ...], samples: float) -> float:
     if min(errors) <= 0:
         return 0.0
     i = 0 if samples <= COUNTS[1] else 1
+    # Errors of independent samples fall with the power 1/2. Stratified
+    # samples fall faster at first, and rare bright paths slower.
     power = math.log(errors[i] / errors[i + 1]) / math.log(COUNTS[i + 1] / COUNTS[i])
     if samples > COUNTS[-1]:
         power = min(max(power, 0.5), 0.75)

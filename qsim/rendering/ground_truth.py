@@ -48,6 +48,7 @@ def flow_between(scene: Scene, rays: Array, hits: Hits, t: float, later: float) 
     for along, axis, size in zip(place, camera.axis, (camera.width, camera.height), strict=True):
         low, high = (edge / camera.focal_pixels for edge in (axis, size - axis))
         inside = inside & (along >= -low) & (along <= high)
+    # Of a resting lens both ends have one scale, and a point at rest has a flow of exactly 0.
     if before is camera:
         flow = np.where(ahead, place - camera.seen(start[:2] / start[2]), 0.0) * camera.focal_pixels
         return flow, inside, end
@@ -113,6 +114,7 @@ def _moved(rays: Array, inverse: Array, before: Array, motion: Array, after: Arr
     """Return rays [3, N] from camera pose `after`, for points at 1 / `inverse` [N] of `before` moved by `motion`."""
     if np.array_equal(motion @ before, after):
         return rays.copy()
+    # Points are (x / z, y / z, 1) z. Divided by z, a far background stays finite: its translation counts 1 / inf = 0.
     whole = np.linalg.inv(after) @ motion @ before
     return whole[:3, :3] @ rays + whole[:3, 3:] * inverse
 
@@ -128,5 +130,6 @@ def _points(body: Body, hits: Hits, chosen: Array, t: float) -> Array:
     corners = body.vertices(t)[body.mesh.faces[hits.triangle[chosen]]]
     weights = hits.weights[chosen]
     pose = body.pose(t)
+    # Barycentric coordinates: the third weight is what the other two leave.
     first = 1 - weights.sum(axis=1)
     return np.einsum("nij,ni->nj", corners, np.column_stack([first, weights])) @ pose[:3, :3].T + pose[:3, 3]

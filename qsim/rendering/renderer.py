@@ -231,6 +231,7 @@ class Renderer:
             plane[:] = means[0]
             if middle:
                 middles[s] = means
+        # A sample without a finite value would spread over the whole code through its mean and its denoiser.
         broken = np.logical_not(np.isfinite(halves).all(axis=1))
         halves.swapaxes(0, 1)[:, broken] = 0
         counts = [np.count_nonzero(fireflies_in(halves[i], broken[i])) for i in range(len(frames))]
@@ -271,6 +272,8 @@ class Renderer:
         n = len(instants)
         samples = budget.grid(len(instants))
         parts = self.film.parts(2 * samples)
+        # One seed for each half, instant and part of the film: equal keys
+        # render equal frames, in any order and on any part.
         seeds = words(key, (2, n * len(parts))).reshape(2, n, len(parts))
         sums = np.zeros((3, 2, *(() if self.scene.bands is None else (3,)), math.prod(self.shape)))
         windows = light_windows(instants, self.exposure)
@@ -289,6 +292,8 @@ class Renderer:
                 for part, seed in zip(parts, seeds[0, i], strict=True):
                     drawn[..., part.start : part.stop] = self._pass(instant, int(seed), samples, budget.bounces, part)
             sums[0] += drawn / n
+            # Every third instant is the middle of three: their mean shows
+            # what fewer instants would change (`blur_left`).
             if i % 3 == 1:
                 sums[1] += drawn * 3 / n
             if i == n // 2:
@@ -319,6 +324,7 @@ class Renderer:
         broken = ~np.isfinite(pictures[0]).all(axis=0)
         pictures[:, :, broken] = 0
         white = self.budget.white or white_in(own.mean(axis=0))
+        # The denoiser sees the complete frame, as windows of it would have other edges.
         surfaces = whole.surfaces([self.time(t)], self.key(t)) if self.budget.denoise else None
         best, _ = best_of(pictures, white, self.budget.denoise)
         cut = reused_mean(own, best, surfaces, white, self.budget.quality).cut(self.crop, self.film.thinned)
@@ -339,6 +345,7 @@ class Renderer:
         error = rms((halves[0] - halves[1]) / 2)
         radiance = halves.mean(axis=0)
         fireflies = int(np.count_nonzero(fireflies_in(halves, broken)))
+        # The picture is clamped at white before it is scored, so its error there counts, beside that without a clamp.
         white = budget.white or white_in(radiance)
         mixed = None
         if budget.denoise:
@@ -375,6 +382,7 @@ class Renderer:
                 found = self.stage.loaded.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
                 bsdf = found.bsdf(ray)
                 seen = found.is_valid()
+                # The denoiser divides by the albedo what it calls texture; a mirror shows other things, and has none.
                 matt = seen & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
                 reflectance = bsdf.eval_diffuse_reflectance(found)
                 albedo = [dr.select(matt, reflectance[i], 1) for i in range(colours)]
@@ -426,6 +434,7 @@ class Renderer:
         flow, inside, then = ground_truth.flow_between(self.scene, rays, hits, now, after)
         back, _, _ = ground_truth.flow_between(self.scene, rays, hits, now, self.time(t - 1))
         self.stage.place(after)
+        # A point is seen again if the later ray to it meets nothing nearer.
         valid = inside & ground_truth.visible(hits.distance, self._caster.cast(camera.pose(after), then))
         return {
             "flow": flow.reshape(2, *shape).astype(np.float32),

@@ -59,6 +59,7 @@ class _Codes:
 def _saturated(sensor: Distribution, exposure: float) -> float:
     """Return arrivals from which the code has its final distribution."""
     end = sensor.white(exposure) * sensor.efficiency + sensor.dark_rate * exposure
+    # Light is doubled until neither mean nor variance of the code changes any more.
     precision = 1e-15 * sensor.levels
     for _ in range(_DOUBLINGS):
         mean, variance = sensor.moments_of(np.array([0.0, end, 2 * end]), exposure)
@@ -79,10 +80,13 @@ def estimate(sensor: Distribution, exposure: float, histogram: Array, confidence
         raise Impossible(code)
     best, one_sided = _highest(likelihood, dark, end)
     peak = likelihood.value(best)
+    # Wilks: twice the fall of the log-likelihood is chi-square with one degree of freedom. At an end
+    # the bound is the light that would give such codes with the chance 1 - confidence.
     fall = -log(1 - confidence) if one_sided else NormalDist().inv_cdf((1 + confidence) / 2) ** 2 / 2
     bright = best == end
     lower = dark if best == dark else _crossing(likelihood, peak - fall, best, dark, end)
     upper = inf if bright else _crossing(likelihood, peak - fall, best, inf, end)
+    # Ever likelier with light: the estimate is where the likelihood is half of its limit (`Estimate`).
     if bright:
         best = _crossing(likelihood, peak - log(2), best, dark, end)
 
@@ -117,6 +121,7 @@ def _highest(likelihood: _Codes, dark: float, end: float) -> tuple[float, bool]:
     if high == end and likelihood.score(end) >= 0:
         return end, True
     best = _root(likelihood.score, low, high)
+    # Behind the full well the likelihood may rise again, to its value in all brighter light.
     if likelihood.value(end) >= likelihood.value(best) - _LEVEL:
         return end, True
     return best, False
@@ -127,6 +132,7 @@ def _typical(likelihood: _Codes, dark: float, end: float) -> float:
     sensor = likelihood.sensor
     exposure = likelihood.exposure
     light = np.append(dark, np.geomspace(max(dark, 1e-3), max(end, 2e-3), 256))
+    # A mean that falls again, of a paralyzable pixel, is kept level: only the rising branch is an answer.
     mean = np.maximum.accumulate(sensor.moments_of(light, exposure)[0])
     code = likelihood.counts @ likelihood.codes / likelihood.counts.sum()
     return float(np.clip(np.interp(code, mean, light), dark, end))

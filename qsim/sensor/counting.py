@@ -75,6 +75,8 @@ class CountingSPAD(SPAD):
 
     def _live(self, arrivals: Array, exposure: float) -> Array:
         """Return the arrivals expected in the live time that remains after k counts: [p] -> [p, levels]."""
+        # After k counts the pixel was dead for k dead times; the rest of the
+        # exposure is the time in which the next arrival can come.
         share = 1 - np.arange(self.levels) * (self.dead_time / exposure)
         return arrivals[:, None] * np.maximum(share, 0)
 
@@ -115,6 +117,8 @@ class CountingSPAD(SPAD):
         k = np.arange(self.levels)
         at_once = poisson_log_pmf(before, k)
         with np.errstate(divide="ignore"):
+            # The integral is a difference of the gamma function's two halves: of
+            # the half that is small, so that it does not cancel.
             lower = gammainc(k + 1.0, before) - gammainc(k + 1.0, live)
             upper = gammaincc(k + 1.0, live) - gammaincc(k + 1.0, before)
             pmf = np.exp(at_once) + np.where(before < k + 1, lower, upper)
@@ -134,6 +138,7 @@ class CountingSPAD(SPAD):
         before, live = (arrivals * share for share in (np.where(codes > 0, shares[0], 1.0), shares[1]))
         at_once = poisson_log_pmf(before, codes)
         with np.errstate(divide="ignore"):
+            # As in `log_pmf_of`, for the codes that occur.
             lower = gammainc(codes + 1.0, before) - gammainc(codes + 1.0, live)
             upper = gammaincc(codes + 1.0, live) - gammaincc(codes + 1.0, before)
             pmf = np.exp(at_once) + np.where(before < codes + 1, lower, upper)
@@ -142,6 +147,8 @@ class CountingSPAD(SPAD):
             tail = _log_tail(at_once, before, live, codes)
             logs = np.where(pmf > _UNDERFLOW, np.log(np.maximum(pmf, _UNDERFLOW)), tail)
             logs[codes == 0] = -arrivals
+            # dP(N = k) = dF_k - dF_(k-1), each a Poisson probability of the
+            # live time after k or k - 1 counts (`slope_of`).
             less = np.log(shares[1]) + poisson_log_pmf(live, codes)
             more = np.log(shares[0]) + poisson_log_pmf(before, np.maximum(codes - 1, 0))
         with np.errstate(over="ignore", invalid="ignore"):
@@ -193,6 +200,7 @@ class CountingSPAD(SPAD):
         if self.bits <= 8:
             return super()._draw_frame(photons, exposure, key, origin)
         if law is not None:
+            # No more counts fit into the exposure than this: a table of all codes would hold zeros beyond.
             enough = min(self.bits, most_counts(exposure / self.dead_time).bit_length())
             draw = super()._draw_frame if enough == self.bits else replace(self, bits=enough)._draw_frame
             return draw(photons, exposure, key, origin).astype(self.dtype)
@@ -229,6 +237,8 @@ class CountingSPAD(SPAD):
 
     def _guess(self, arrivals: Array, exposure: float, z: Array) -> Array:
         """Return about the code at z standard deviations of a renewal count, whose gaps are a dead time and a wait."""
+        # Renewal theory (Cox, 1962): N counts have the mean T / (tau + 1 /
+        # lambda), and variance lambda T / (1 + lambda tau)^3.
         dead = 1 + arrivals * (self.dead_time / exposure)
         return np.rint((arrivals + dead - 1) / dead + z * np.sqrt(arrivals / dead) / dead)
 
@@ -293,6 +303,8 @@ def _log_tail(at_once: Array, before: Array, live: Array, k: Array) -> Array:
     bright = live > k
     end = np.where(bright, live, before)
     with np.errstate(divide="ignore", invalid="ignore"):
+        # Laplace's method: the integrand falls from its larger end like exp(-rate
+        # distance), with the slope of log Pois(k; x) there, k / x - 1.
         rate = np.maximum(np.abs(1 - k / end), 1e-9)
         integral = poisson_log_pmf(end, k) + np.log(-np.expm1(-rate * (before - live)) / rate)
     return np.logaddexp(at_once, np.where(end > 0, integral, -np.inf))

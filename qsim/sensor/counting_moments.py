@@ -29,6 +29,7 @@ def renewal(mean: Array, share: float) -> tuple[Array, Array]:
     fill = mean * share
     d = 1 + fill
     first = mean / d * (1 + fill * share / (2 * d))
+    # The residue at s = 0 to the second order in tau / T, collected so that equal terms of E[N^2] and E[N]^2 are gone.
     rest = fill * (4 - d) / (2 * d**2) + 5 * fill**3 / (4 * d**3) - 2 * fill**2 / (3 * d**2)
     return first, mean / d * (1 / d**2 + share * rest)
 
@@ -43,6 +44,7 @@ def faded(mean: Array, share: float) -> Array:
     result = np.zeros(len(mean), bool)
     some = (fill > 0) & (fill < 300)  # beyond, counts are regular
     x = fill[some]
+    # The slowest pole decides: its real part over the exposure is the exponent with which it fades.
     result[some] = (lambertw(x * np.exp(x), 1).real - x) / share + np.log1p(mean[some]) < FADED
     return result
 
@@ -85,6 +87,8 @@ def summed(mean: Array, around: Array, reach: Array, top: int, tail: Tail) -> tu
         passed = np.zeros(codes.shape)
         light = np.broadcast_to(mean[some, None], codes.shape)
         passed[inside] = tail(codes[inside], light[inside], below[inside])
+        # E (N - c) = sum of P(N > k) over k >= c - sum of P(N <= k) over k
+        # < c; E (N - c)^2 weights them by |2 (k - c) + 1|.
         away = 2 * (codes - anchor[some, None]) + 1
         shift = np.where(below, -passed, passed).sum(axis=1)
         first[some] = anchor[some] + shift

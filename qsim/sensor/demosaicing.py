@@ -83,10 +83,13 @@ def _kernels(weights: bytes, rows: int, columns: int) -> Array:
     dy, dx = (each.ravel() for each in np.mgrid[-reach : reach + 1, -reach : reach + 1])
     near = np.exp(-np.hypot(dy[:, None] - dy, dx[:, None] - dx) / LENGTH)
     here = np.exp(-np.hypot(dy, dx) / LENGTH)
+    # The prior: bands and places are correlated independently of each other, so that covariances are products.
     between = np.full((3, 3), BETWEEN) + (1 - BETWEEN) * np.eye(3)
     found = np.empty((rows, columns, 3, 2 * reach + 1, 2 * reach + 1))
     for i, j in np.ndindex(rows, columns):
         own = tile[:, (i + dy) % rows, (j + dx) % columns]  # [3, pixels]
+        # Wiener's filter: covariance of the seen pixels, with the prior of flat
+        # colours and noise, and covariance of them with the wanted bands.
         both = own.T @ between @ own * near + _FLAT * (own.T @ own) + NOISE * np.eye(len(dy))
         seen = between @ own * here + _FLAT * own
         found[i, j] = np.linalg.solve(both, seen.T).T.reshape(found.shape[2:])

@@ -152,6 +152,7 @@ def response(sensor: Distribution, exposure: float, points: int = POINTS) -> Res
     Where the response falls again (a paralyzable counter) the table holds its rising branch only. `ValueError` for a
     sensor whose mean code does not rise.
     """
+    # Shot noise grows with the root of the light: even steps of the root resolve each level alike.
     photons = np.linspace(0, np.sqrt(_end_of_rise(sensor, exposure)), points) ** 2
     mean, variance = sensor.moments(photons, exposure)
     rising = np.concatenate([[True], mean[1:] > np.maximum.accumulate(mean)[:-1]])
@@ -235,6 +236,7 @@ class _Likelihood:
         slope = np.diff(self.sensor.dcdf(photons, self.exposure), axis=-1, prepend=0.0)
         with np.errstate(over="ignore", invalid="ignore"):
             ratio = slope * np.exp(-self._log_pmf(photons, rows))
+        # Codes that did not occur, or that light does not change, add nothing, though their logarithm is infinite.
         ratio[(slope == 0) | (self.counts[rows] == 0)] = 0.0
         return (self.counts[rows] * ratio).sum(axis=1)
 
@@ -248,6 +250,8 @@ def _estimate(likelihood: _Likelihood, grid: _Grid, confidence: float) -> Array:
     best = table.argmax(axis=1)
     end = len(grid.photons) - 1
     everything = np.arange(len(table))
+    # Saturated codes level out: within 1e-6 of the end, more light is as likely. A rising
+    # branch that ends earlier (dead time) is judged by the slope at its end.
     if grid.saturates:
         bright = table[:, end] >= table.max(axis=1) - 1e-6
     else:
@@ -260,6 +264,7 @@ def _estimate(likelihood: _Likelihood, grid: _Grid, confidence: float) -> Array:
     photons = np.where(bright, grid.photons[end], 0.0)
     photons[inner] = _root(likelihood.score, left, right, inner)
     peak = np.where(bright, table[:, end], likelihood.value(photons, everything))
+    # Wilks' theorem for two sides; at an end, the chance of such codes itself.
     two_sided = -(NormalDist().inv_cdf((1 + confidence) / 2) ** 2) / 2
     level = peak + np.where(dark | bright, log(1 - confidence), two_sided)
     lower = _crossing(likelihood, grid, table, photons, level, -1)

@@ -108,6 +108,7 @@ class EventPixels:
         self.seen = self.light  # y
         self.change = np.zeros(current.size)  # D
         if camera.leak_rate > 0:
+            # As a camera that has been running: the time since the last leak event is uniform over their period.
             phase = words(replace(key, stage=_PHASE + key.stage), shape, origin)
             self.change = uniform(phase).ravel() * self.on
         self.held = np.zeros(current.size)  # s from now until the end of the refractory time
@@ -188,6 +189,8 @@ class EventPixels:
                 waits = self.noise.waits(pixels[left], self.drawn[pixels[left]])
                 noisy[left] += waits / noise_rate[left]
         with np.errstate(invalid="ignore"):
+            # Waits are kept in mean intervals, so that they go on at the rate of the next
+            # interval: a Poisson process of changing rate, by inverting its integral.
             wait = np.where(noise_rate > 0, (noisy - seconds) * noise_rate, self.wait[pixels])
         return _joined(parts), change, held, wait
 
@@ -199,6 +202,7 @@ class EventPixels:
         polarities = self.noise.polarities(pixels[left], self.drawn[pixels[left]])[free]
         self.drawn[pixels[left]] += 1
         change[taken] = 0
+        # A noise event resets the pixel as any other; within a refractory time it is swallowed.
         held[taken] = at[free] + self.camera.refractory
         held[left] = np.maximum(held[left], at)
         return Emitted(at[free], pixels[taken], polarities)
@@ -222,6 +226,8 @@ class _Run:
         with np.errstate(divide="ignore", invalid="ignore"):
             self._first = self._start + self._room / speed
             self._period = self._crossing / speed + refractory
+            # The first threshold after `room`, then one each period. 1 + REACHED: a
+            # change that misses a threshold by rounding has reached it.
             number = np.floor((self._stop - self._first) / self._period + (1 + REACHED))
         runs = (speed > 0) & np.isfinite(self._first) & np.isfinite(self._period) & (self._start < self._stop)
         self.number = np.where(runs, np.maximum(number, 0), 0)
@@ -241,6 +247,7 @@ class _Run:
             last = np.minimum(self._first + (self.number - 1) * self._period, self._stop)
         fired = self.number > 0
         free = np.where(fired, last + self._refractory, self._start)
+        # D begins again at 0 with the last event, and grows from the end of the refractory time on.
         grown = self._rate * np.maximum(self._stop - free, 0)
         return np.where(fired, grown, self._change + grown), free
 

@@ -88,6 +88,7 @@ class Paralyzable:
             some = None if wanted is None else wanted[rows, : self.possible]
             part = table.evaluate_log_pmf(mean[rows], some) if table else self._paralysed(mean[rows]).log_pmf()
             result[rows, : self.possible] = part
+        # No count at all means no arrival at all, since the pixel begins live: exp(-mean), exact in any light.
         result[:, 0] = -mean
         return result
 
@@ -150,6 +151,7 @@ class Paralyzable:
 
         `brief`: None instead of a table where the series gives the cdf as well, though not its far tails.
         """
+        # Lengths are powers of two, so that all light levels share a few cached tables.
         length = np.exp2(np.ceil(np.log2(mean + 12 * np.sqrt(mean) + 60)))
         if brief and self.ratio < LEAST:  # few moments are quicker than a long table
             expected = mean * np.exp(-mean / self.ratio) * (1 - 1 / self.ratio)
@@ -180,9 +182,11 @@ def arrival_table(ratio: float, levels: int, last: int) -> Mixture:
     codes[:, :width] = pmf[:, :width]
     at_least_top = pmf[:, top:].sum(axis=1)
     below_top = codes[:, :top].sum(axis=1)
+    # The top code is what the others leave, unless they leave little: then its own terms are summed.
     codes[:, top] = np.where((below_top < 0.5) & (counted < most), 1 - below_top, at_least_top)
     cdf = np.minimum(np.cumsum(codes, axis=1), 1.0)
     cdf[:, -1] = 1.0
+    # 1 - cdf, summed from the top, where the cdf is near 1.
     survival = np.pad(np.cumsum(codes[:, :0:-1], axis=1)[:, ::-1], ((0, 0), (0, 1)))
     # A difference on the smaller side of the distribution
     slope = np.where(cdf[:-1] < 0.5, np.diff(cdf, axis=0), -np.diff(survival, axis=0))
@@ -200,6 +204,7 @@ def _log_counts(ratio: float, counted: int, last: int) -> Array:
     n = np.arange(last)[:, None]
     k = np.arange(counted + 1)[None, :]
     with np.errstate(divide="ignore", invalid="ignore"):
+        # The formula of the module's docstring: C(n-1, k-1) (l / R)^n H, in logarithms.
         log_choices = gammaln(n) - gammaln(k) - gammaln(n - k + 1)
         log_length = np.log1p(-np.minimum((k - 1) / ratio, 1.0))
         result = np.where((k >= 1) & (n >= k), log_choices + n * log_length + log_shares, -np.inf)
@@ -209,6 +214,7 @@ def _log_counts(ratio: float, counted: int, last: int) -> Array:
 
 def _log_shares(ratio: float, counted: int, last: int) -> Array:
     """Return log H(n - k, k; ratio - k + 1) at [n, k]; zeros where n < k or k = 0."""
+    # A column holds one l = R - c; the recursion from l to l - 1 is a step to the next column.
     lengths = ratio - np.arange(min(floor(ratio), counted + last) + 1)  # l of each column
     shorter = np.append(lengths[1:], -1.0)
     fits = shorter >= 0
@@ -224,9 +230,11 @@ def _log_shares(ratio: float, counted: int, last: int) -> Array:
     scale = np.ones(len(lengths))  # shrink^(m - 1)
     for m in range(1, last):
         if m > 1:
+            # de Boor and Cox, scaled by l^(m-1), which keeps the numbers in range.
             growth = np.where(fits, (m - lengths) * per_length * scale, 0.0)
             density = np.where(lengths < m, density + growth * _next(density), 0.0)
             scale = scale * shrink
+        # The recursion in H = A (m+k)! / l^(m+k): every step along k adds a positive term, hence the running sum.
         added = m * per_length * scale * powers * _next(h)
         h = density + np.cumsum(np.where(fits, added, 0.0), axis=0)
         fitting = k[k + m < last]
@@ -276,6 +284,8 @@ class _Paralysed:
         result = np.full((len(self.mean), self.levels), -np.inf)
         result[:, 0] = -self.mean
         for k in range(1, min(self.levels, len(self.j) + 1)):
+            # Inclusion and exclusion. In this light the terms fall quickly,
+            # so that the alternating signs cost no digits.
             ways = binom(self.j, k) if k < self.levels - 1 else binom(self.j - 1, k - 1)
             signed = np.where(self.j >= k, (-1.0) ** (self.j - k) * ways, 0.0)
             total = (signed * self.moments * self.rate[:, None] ** np.maximum(self.j - k, 0)).sum(axis=1)
@@ -324,6 +334,7 @@ def _moments(mean: Array, a: float, last: int) -> tuple[Array, Array]:
         integral = -np.expm1(-mean * end)
         for r in range(1, j):
             before = integral
+            # By parts: J(r) = (c^r - fade rest^r) / r! - J(r-1) / mean.
             integral = (c**r - fade * rest**r) / gamma(r + 1) - integral / mean
         open_end = rest**j / gamma(j + 1)
         moments[:, j - 1] = integral + mean * factor * open_end
@@ -370,6 +381,7 @@ def generating(log_z: Array, mean: Array, ratio: float) -> tuple[Array, Array, A
 
     a = 1 / ratio
     less = np.expm1(log_z)
+    # less = z - 1. The pole solves s = r (z - 1) exp(-s tau); with W, share = 1 + s / lambda.
     w = lambertw(mean * a * np.exp(-mean * a) * less)
     share = 1 + less * np.exp(-mean * a - w)
     change = (share - 1) * (1 - mean * a) / (1 + w)  # ds/dmean
@@ -389,12 +401,16 @@ def circle(mean: Array, inside: Array, ratio: float) -> Circle:
     """Return the nodes of pixels of Poisson means [p], `inside` or outside of |z| = 1: bool [p]."""
     first, variance, _ = moments(mean, ratio)
     deviation = np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
+    # |g| falls on the circle as exp(-2 variance sin(theta / 2)^2), as
+    # of a Poisson number; behind `end` nothing is left.
     end = 2 * np.arcsin(np.sqrt(np.minimum(_FALL / 2 / np.maximum(variance, 1.0), 1.0)))
     count = int(np.ceil((end * deviation).max(initial=_STEP) / _STEP))
     angle = end / count * (np.arange(count)[:, None] + 0.5)
     log_z = np.where(inside, -_RADIUS, _RADIUS) / deviation + 1j * angle
     power, factor, _ = generating(log_z, mean, ratio)
     factor = -end / count / np.pi / (factor * np.expm1(log_z))
+    # Equal steps of theta also count the codes that are a whole number of turns of the nodes
+    # away. The nearest of them is certain to be 1; its weight is known and taken off.
     turn = np.exp(-2 * np.pi * _RADIUS / (end / count * deviation))
     return Circle(log_z, power, factor, inside, first, deviation, turn)
 
@@ -404,6 +420,7 @@ def decide(ratio: float, top: int, below: Array, above: Array, mean: Array) -> t
 
     Both are [p], of (u, 1 - u) and Poisson means [p].
     """
+    # Cornish-Fisher to the third cumulant; where it misses, the search goes on from there.
     first, variance, third = moments(mean, ratio)
     z = normal(below, above)
     skew = third / np.maximum(variance, 1e-9)
@@ -437,6 +454,8 @@ def steps(ratio: float, count: int, mean: Array) -> tuple[Array, Array]:
     One circle serves all codes, so close to |z| = 1 that no code is amplified by more than exp(7): an error below
     1e-11.
     """
+    # A trapezoidal rule over the whole circle is a discrete Fourier transform:
+    # with more nodes than codes it is exact but for the wrapped tail.
     half = max(64, 2 * (count + 1))
     log_z = -14 / half + 1j * np.pi / half * (np.arange(half)[:, None] + 0.5)
     turned = np.exp(-np.arange(count)[:, None] * log_z[:, 0]) / half

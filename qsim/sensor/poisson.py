@@ -35,6 +35,7 @@ def poisson_log_pmf(mean: Array, n: Array) -> Array:
     n = np.asarray(n, float)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         excess = (n - mean) / mean
+        # n log(n / mean) - n + mean = mean [(1 + x) log(1 + x) - x], x = n / mean - 1.
         deviance = mean * (xlog1py(1 + excess, excess) - excess)
         result = -deviance - 0.5 * np.log(2 * np.pi * np.maximum(n, 1)) - _stirling_error(n)
     # Where n / mean overflows nothing cancels
@@ -47,6 +48,7 @@ def _stirling_error(n: Array) -> Array:
 
     n = np.maximum(n, 1.0)
     direct = gammaln(n + 1) - (n + 0.5) * np.log(n) + n - 0.5 * np.log(2 * np.pi)
+    # Stirling's series, which has 16 digits from n = 20 on.
     series = (1 / 12 - (1 / 360 - (1 / 1260 - (1 / 1680 - 1 / (1188 * n**2)) / n**2) / n**2) / n**2) / n
     return np.where(n < 20, direct, series)
 
@@ -106,6 +108,7 @@ class Mixture:
 
     def evaluate_cdf(self, mean: Array) -> Array:
         """Return P(code <= k): Poisson means [p] -> [p, levels]."""
+        # Codes that are reached whatever n is have exactly 1, not a sum that rounds.
         certain = (self.tail_cdf == 1) & (self.cdf == 1).all(axis=0)  # the top code
         result = self._mix(mean, self.cdf, np.where(certain, 0.0, self.tail_cdf))
         if self.first:
@@ -153,6 +156,7 @@ class Mixture:
         for start in range(0, len(rows), step):
             pairs = slice(start, start + step)
             terms = weights[rows[pairs]] + table[codes[pairs]]
+            # log sum exp, from its largest term.
             largest = np.maximum(terms.max(axis=1), -1e300)  # keeps -inf - -inf away
             with np.errstate(divide="ignore"):
                 result[pairs] = largest + np.log(np.exp(terms - largest[:, None]).sum(axis=1))

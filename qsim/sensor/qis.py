@@ -178,6 +178,8 @@ class QIS(Sensor):
         mean = self.arrivals(photons, exposure).ravel()
         variance = mean + self.read_noise**2
         z = ndtri(u.ravel())
+        # Cornish-Fisher: the quantile of electrons plus read noise from mean, variance
+        # and third cumulant, which is the mean, as read noise has none.
         skew = np.divide(mean, variance, out=np.zeros_like(mean), where=variance > 0) * (z * z - 1) / 6
         electrons = mean + z * np.sqrt(variance) + skew
         if self.full_well is not None:
@@ -204,6 +206,7 @@ class QIS(Sensor):
     def _blurred_steps(self) -> BlurredSteps | None:
         """Return the steps of strong read noise; None for less, and where the full well is in reach."""
         places = (np.arange(self.levels - 1) + 0.5 - self.offset) / self.gain
+        # The full well cuts the law off, and its cumulants no longer describe it.
         if self.read_noise < NOISY or (self.full_well or inf) < places[-1] + _BLUR * self.read_noise:
             return None
         return BlurredSteps(places, self.read_noise)
@@ -240,6 +243,7 @@ class QIS(Sensor):
         if self.full_well is not None:
             electrons = np.minimum(electrons, self.full_well)
         below, above = uniform_pair(w[2], w[3])
+        # Inverting both laws, not rejecting, uses as many numbers for every pixel: so a key names them all.
         electrons = electrons + self.read_noise * noise * normal(below, above)
         return self.codes_of(electrons + offset / self.gain)
 
@@ -256,6 +260,8 @@ class QIS(Sensor):
         spread = np.broadcast_to(self.read_noise * noise, mean.shape)
         shift = np.broadcast_to(offset / self.gain, mean.shape)
         steps = (np.arange(self.levels - 1) + 0.5 - self.offset) / self.gain
+        # Electrons are summed to where 1e-12 of the brightest pixel's law
+        # is left; that rest has the last number of them.
         last = int(np.ceil(pdtrik(1 - 1e-12, max(float(mean.max()), 1e-6)))) + 1
         below = np.zeros_like(mean)
         cdf = np.zeros((*mean.shape, self.levels))
@@ -264,6 +270,7 @@ class QIS(Sensor):
             electrons = n if self.full_well is None else min(n, self.full_well)
             with np.errstate(divide="ignore", invalid="ignore"):
                 passed = ndtr((steps - (electrons + shift)[..., None]) / spread[..., None])
+            # Without read noise the step is where the ADC rounds it, ties included.
             exact = self.codes_of(electrons + shift)[..., None] <= np.arange(self.levels - 1)
             passed = np.where(spread[..., None] > 0, passed, exact)
             cdf[..., :-1] += (up_to - below)[..., None] * passed
@@ -303,6 +310,7 @@ class Thresholds:
     def slope(self, codes: Array, mean: Array) -> Array:
         """Return dF/dmean of pairs: codes int [p], Poisson means [p] -> [p]."""
         ends = np.column_stack([np.ones(len(self.first)), self.weights, self.tail])
+        # d/dmean of a Poisson sum is the sum over the steps of its weights (poisson.py).
         falls = np.diff(ends, axis=1)  # of P(code <= k | n) from n = first - 1 on
 
         def block(k: Array, some: Array) -> Array:
@@ -396,6 +404,8 @@ def thresholds(sensor: QIS) -> Thresholds | None:
         electrons = np.minimum(first[:, None] + np.arange(width), well)
         tail = ndtr((at - well) / noise)
         return Thresholds(first.astype(np.int64), ndtr((at[:, None] - electrons) / noise), tail)
+    # Where the ADC sees no noise, a threshold lies between two electrons:
+    # these are tried by its own rounding, which decides ties.
     around = np.floor(at)[:, None] + np.arange(-1, 3)
     kept = sensor.codes_of(around) <= codes[:, None]  # ties as the ADC rounds them
     first = np.clip(
@@ -414,8 +424,11 @@ def electron_table(sensor: QIS, start: int, stop: int) -> Mixture:
     low, high = ((k + 0.5 - sensor.offset) / sensor.gain for k in (start - 1, min(stop, top) - 1))
     reach = _REACH * sensor.read_noise + 1
     well = inf if sensor.full_well is None else sensor.full_well
+    # Outside of the reach of read noise all electrons give codes below the block, or above it.
     first = max(floor(min(low - reach, well)), 0) if start else 0
     last = max(ceil(min(high + reach, well)), first)
+    # The last row stands for all electrons from there on: those of a full
+    # well, or so many that no code of the block is left.
     saturated = well if last >= well else inf  # electrons of all n >= last
     electrons = np.append(np.arange(first, last, dtype=float), saturated)
     z = _normal_thresholds(sensor, electrons, np.arange(start - 1, stop))

@@ -89,6 +89,7 @@ def moments(sensor: Converter, mean: Array) -> tuple[Array, Array]:
     high = chain.level(most) + SIGMAS * chain.blur
     first = np.zeros(len(mean))
     second = np.zeros(len(mean))
+    # Codes that no light of the window leaves, 0 and the top, need no sum.
     first[low > chain.top - 0.5] = chain.top
     full = least >= chain.well
     if full.any():
@@ -96,6 +97,7 @@ def moments(sensor: Converter, mean: Array) -> tuple[Array, Array]:
     left = ~full & (low <= chain.top - 0.5) & (high >= 0.5)
     free = left & (low > -0.5) & (high < chain.top + 0.5) & (most < chain.well)
     spread = chain.gain**2 * mean + chain.blur**2
+    # The cheapest law that is exact to 1e-13 at this light: series, smooth thresholds, or the sum over electrons.
     by_series = free & (chain.blur >= FINE) & (spread >= SPREAD)
     smooth = (mean >= BRIGHT) & (chain.gain**2 * mean >= BLURRED)
     by_thresholds = free & ~by_series & smooth & (chain.gain < COARSE)
@@ -132,11 +134,15 @@ def _by_series(chain: Chain, mean: Array) -> tuple[Array, Array]:
         some = np.flatnonzero(terms >= j - 1)
         t = 2 * pi * j
         light = mean[some]
+        # Phases are taken modulo one turn before they are multiplied: j gain may be many turns.
         angle, turn = (2 * pi * (value - np.rint(value)) for value in (j * chain.gain, j * chain.offset))
+        # cos x - 1 as -2 sin^2(x / 2), which keeps its digits for small gains.
         change = complex(-2 * np.sin(angle / 2) ** 2, np.sin(angle))  # exp(i t gain) - 1
         size = np.exp(light * change.real - (t * chain.blur) ** 2 / 2)
         wave = size * np.exp(1j * (turn + light * change.imag))
         sign = (-1) ** (j + 1) / (pi * j)
+        # rint X = X - saw(X). Mean and variance need E saw, E (X saw) and E saw^2;
+        # the second is the derivative of the characteristic function.
         saw[some] += sign * wave.imag
         product[some] += sign * (wave * (1j * t * chain.blur**2 + light * chain.gain * change)).imag
         square[some] -= sign / (pi * j) * wave.real
@@ -161,10 +167,12 @@ def _by_thresholds(chain: Chain, mean: Array) -> tuple[Array, Array]:
         some = slice(starts[i], stops[i])
         x = places[some]
         ratio = np.log1p((x - light) / light)
+        # The Poisson density at a real number of electrons, by Stirling's series.
         p = np.exp(x - light - x * ratio - 0.5 * (np.log(2 * pi * light) + ratio) - 1 / (12 * x))
         slope = -ratio - 0.5 / x  # of log p
         bend = slope**2 - 1 / x  # p'' / p
         d1, d2, d3 = shifts[:, some]
+        # Taylor's series of E G(t + d), with the correction -p''/24 of the smooth density in its first term.
         change = -p * (d1 * (1 - bend / 24) + d2 / 2 * slope + d3 / 6 * bend)
         first[i] = change.sum()
         second[i] = change @ (2 * (codes[some] - base[i]) + 1)
@@ -218,6 +226,7 @@ def _summed(chain: Chain, mean: Array) -> tuple[Array, Array]:
             if log_factorial is None or mean[i] == 0:
                 weight = np.exp(poisson_log_pmf(mean[i], n[some]))
             else:
+                # log Pois up to a constant: the weights are divided by their sum in the end.
                 weight = n[some] * np.log(mean[i])
                 weight -= log_factorial[some]
                 weight -= weight.max()
@@ -239,6 +248,8 @@ def shared_tables(chain: Chain, mean: Array) -> Iterator[tuple[Array, Array]]:
     least, most = window(mean)
     root = np.sqrt(mean)
     with np.errstate(invalid="ignore"):
+        # Sums of smooth terms are exact in steps of about half the narrower of their widths, of read noise
+        # and of the Poisson law. Steps are powers of two, so that levels of light share tables.
         steps = np.where(chain.noise > 0, 0.5 * chain.noise * root / (chain.noise + root), 1.0)
     steps = np.where(most >= chain.well, 1.0, np.nan_to_num(steps))
     steps = 2.0 ** np.floor(np.log2(np.maximum(steps, 1.0)))
@@ -306,6 +317,7 @@ def _counted(x: Array, blur: float, top: int) -> tuple[Array, Array]:
     for j in range(ceil(2 * SIGMAS * blur) + 2):
         k = lowest + j
         below = k < anchor
+        # E clip(rint) = anchor + sum P(code > k) above it - sum P(code <= k) below it.
         passed = ndtr(np.where(below, k + 0.5 - x, x - k - 0.5) / blur)
         passed[(k < 0) | (k >= top)] = 0.0
         first += np.where(below, -passed, passed)

@@ -191,6 +191,8 @@ class Sensor(Distribution):
         photons = _checked(photons, engine)
         check_exposure(exposure)
         require_counters(key, photons.shape, origin, self.counters)
+        # The compiled engine draws four columns from one block of random words: a crop
+        # that begins within such a block would need its first words again.
         direct = engine != "reference" and origin[1] % 4 == 0
         plan = self._usable_plan(photons, exposure) if direct else None
         if plan is None:
@@ -268,6 +270,8 @@ class Sensor(Distribution):
 
     def _draw_rows(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int], pixels: int) -> Array:
         codes = np.empty(photons.shape, self.dtype)
+        # Blocks of rows bound the memory of the table [pixels, levels]; each
+        # pixel has its own number, so their height changes no code.
         rows = max(1, pixels // max(photons.shape[1], 1))
         for y in range(0, photons.shape[0], rows):
             block = np.asarray(photons[y : y + rows], np.float64)

@@ -141,6 +141,7 @@ class BinarySPAD(SPAD):
 
         m = self.planes
         per_plane = arrivals / self.planes
+        # Binomial(M, p) at p = 1 - exp(-x), x = arrivals / M: log C(M, k) + k log p - (M - k) x.
         ways = gammaln(m + 1) - gammaln(codes + 1) - gammaln(m - codes + 1)
         logs = ways + codes * np.log(-np.expm1(-per_plane)) - (m - codes) * per_plane
         return logs, (codes / np.expm1(per_plane) - (m - codes)) / m
@@ -184,6 +185,8 @@ class BinarySPAD(SPAD):
                 f"got {list(photons.shape)}"
             )
         require_counters(key, (len(photons) // self.planes, *photons.shape[1:]), origin, self.planes)
+        # Plane p of all planes has the random numbers of frame p of a 1-bit
+        # sensor: two depths of one plane rate share their photons.
         single = self.plane
         codes = np.empty((len(photons) // self.planes, *photons.shape[1:]), self.dtype)
         for t in range(len(codes)):
@@ -216,9 +219,12 @@ class BinarySPAD(SPAD):
             u = below[left]
             v = above[left]
             low = u < 0.5
+            # P(Binomial(M, p) <= k) = I_(1-p)(M - k, k + 1), the regularised beta function. It is compared on
+            # the side where the probability is small, so that tails of 1e-19 keep their digits.
             tail = betainc(np.where(low, m - k, k + 1.0), np.where(low, k + 1.0, m - k), np.where(low, q, p))
             return np.where(low, u >= tail, v <= tail)
 
+        # The normal approximation, from which the search takes a few steps.
         z = normal(below, above)
         guess = m * lit + z * np.sqrt(m * lit * dark)
         return search(passed, m, np.rint(guess)).reshape(photons.shape).astype(self.dtype)

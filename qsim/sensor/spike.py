@@ -94,6 +94,7 @@ class SpikeCamera(Sensor):
             slope = np.where(arrivals < self.threshold, 1 / self.threshold, 0.0)
         else:
             longer, change = self._interval(arrivals)
+            # P(spike) = 1 / E[I], and d(1 / E) = -dE / E^2.
             slope = -change / (1 + longer) ** 2
         return np.stack([-slope, np.zeros_like(slope)], axis=-1)
 
@@ -171,6 +172,7 @@ class SpikeCamera(Sensor):
         """
         first, second = (words(key, photons.shape, origin, redraw) for redraw in (0, 1))
         charge = charge + poisson_quantile(self.arrivals(photons, exposure), *uniform_pair(first, second))
+        # One spike a plane at most: further thresholds stay in the charge, or are lost by a reset to zero.
         fired = charge >= self.threshold
         return fired, np.where(fired, charge - self.threshold if self.subtracts else 0.0, charge)
 
@@ -187,6 +189,7 @@ def interval(arrivals: Array, threshold: int) -> tuple[Array, Array]:
     change = np.full(arrivals.shape, -np.inf)
     reach = threshold + 12 * np.sqrt(threshold) + 60  # electrons after which a pixel has fired, to 1e-16
     bright = arrivals * _TERMS >= reach
+    # Bright: intervals are short, and P(I > i) is summed until the pixel has fired for certain.
     planes = np.arange(1, _TERMS + 1)
     light = arrivals[bright, None]
     longer[bright] = pdtr(threshold - 1, planes * light).sum(axis=1)

@@ -50,6 +50,7 @@ class CodeTruth:
         Rows with their own time are those of the middle of each row's exposure, or (`at` is "frame") of all together.
         crop = (y, x, height, width) [px] is a part of the sensor, before which the scene is `moved` by (y, x) px.
         """
+        # As if the instant lasted for the whole code: truth has the scale of the code, without its blur.
         factor = self.factor * self.timing.frames
 
         def instant(frame: int, part: Crop | None = None) -> Array:

@@ -44,6 +44,7 @@ class Drawer(ABC):
 
     def frames(self, start: int, stop: int) -> Array:
         """Return codes [stop - start, H, W] of stream frames start ... stop - 1; those before where pixels remember."""
+        # Pixels with a memory are drawn from the first frame on; frames that nobody asked for are thrown away.
         first = 0 if self.remembers else start
         blocks = self.blocks(first, stop, 1 if self.remembers else stop - first)
         return np.concatenate([block for n, block in enumerate(blocks, first) if n >= start])
@@ -83,11 +84,13 @@ class Sampled(Drawer):
         """Yield the codes [n, H, W] of equal exposures, of successive ranges of stream frames from `start` on."""
         light = (self.exposures.light(self.read, *place) for place in places)
         source = self.exposed if self.array is None else self.array
+        # Exposures that follow each other have numbers that follow each other: one key names a block of any length.
         key = self.key.at(self.exposures.number(start))
         return source.blocks(light, self.exposures.seconds(start), key, self.origin, self.engine)
 
     def packed_blocks(self, frames: int, step: int) -> Iterator[Array]:
         timing = self.exposures.timing
+        # The engine packs only codes that are drawn as they are stored: no map, memory, sum or schedule changes them.
         if self.array is not None or self.remembers or timing.frames > 1 or timing.shares is not None:
             yield from super().packed_blocks(frames, step)
             return

@@ -102,6 +102,7 @@ class EventDraw:
         pixels = EventPixels(self.camera, self.current(clip, 0), self.key, clip.origin)
         for t in range(1, frames):
             found = pixels.advance(self.current(clip, t), 1 / clip.frame_rate)
+            # Microseconds are what event cameras and their file formats count.
             times = np.rint(((t - 1) / clip.frame_rate + found.times) * 1e6).astype(np.int64)
             yield _in_order(times, found.pixels, found.polarities, clip.shape[2])
             if progress is not None:
@@ -134,6 +135,7 @@ def prepare(clip: ClipFolder, sensing: EventSensing) -> EventDraw:
         raise ValueError(f"{clip.name}: {height} x {width} pixels; events name rows and columns below {_WIDEST}")
     level = light_level(clip, ppp=sensing.ppp, lux=sensing.lux, pixel_pitch=sensing.pixel_pitch)
     camera = cameras.load(sensing.camera)
+    # Effects that depend on the light are stated relative to a bright current: that of the white of a clip.
     bright = WHITE_PER_MEAN * level.ppp * camera.quantum_efficiency / clip.exposure
     key = Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
     return EventDraw(camera.with_bright(bright) if camera.needs_bright else camera, level, key)

@@ -105,6 +105,8 @@ class Exposures:
         """Return the exposure of clip frames that is open for a share of their time, around its middle."""
         full = len(frames) * self.exposure
         seconds = share * full
+        # The gate is cut from both ends of the full exposure, so that codes
+        # of unequal exposures keep even distances in time.
         begin = (frames.start + self.shifts) / self.frame_rate + (full - seconds) / 2
         return Exposure(frames, parts, seconds, begin, begin + seconds)
 
@@ -159,6 +161,7 @@ class Exposures:
         rows = self.timing.rows
         if rows is None or at == "frame":
             return read(self.middle_frame(t), crop)
+        # The middle of a row's exposure is late by its delay; the clip frame that contains it has the row's truth.
         numbers = np.floor(self._middle(t) + self.shifts).astype(int)
         return rows.picked(read, numbers, crop or (0, 0, *self.shape[1:]))
 

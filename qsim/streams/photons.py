@@ -102,6 +102,7 @@ def clip_photons(
     blurs by the lens's Airy pattern.
     """
     if diffraction and crop is not None:
+        # Light from outside of a crop reaches into it, so the whole frame is blurred and cut afterwards.
         whole = clip_photons(clip, t, factor, sharp=sharp, diffraction=True)
         y, x, height, width = crop
         return whole[..., y : y + height, x : x + width]
@@ -117,6 +118,7 @@ def clip_photons(
         x = x + crop[1]
     if clip.bands is not None:
         if diffraction:
+            # The Airy disk grows with the wavelength: each band has its own.
             cameras = [replace(camera, wavelength=wavelength) for wavelength in clip.bands]
             radiance = np.stack([diffract(*each) for each in zip(radiance, cameras, strict=True)])
         return band_photons(radiance, camera, clip.exposure, clip.bands, origin=(y, x)) * factor

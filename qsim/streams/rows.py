@@ -81,6 +81,7 @@ class Rows:
         """Return the light [h, w] of a crop that begins at clip frame t; `shifts` are those of all lines."""
         found = np.empty(crop[2:])
         for ahead, part, lines in self._blocks(np.floor(shifts).astype(int), crop):
+            # Lines of one whole shift share two clip frames; what is left of their shift mixes these two.
             share = np.expand_dims((shifts - np.floor(shifts))[lines], 1 - self.axis)
             light = read(t + ahead, part)
             if share.any():

@@ -61,6 +61,7 @@ def stored(stream: Stream) -> Draw:
         known = ", ".join(DRAWERS)
         raise ValueError(f"{stream.path}: drawn by {info.drawn_by!r}, which is none of {known}; sense it again")
     timing = stream.timing
+    # A description holds the light of a code, a draw that of a clip frame.
     level = LightLevel(info.light.factor, info.light.ppp / timing.frames, info.light.before / timing.frames, None)
     sensing = info.sensing
     return Draw(

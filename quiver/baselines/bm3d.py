@@ -208,8 +208,10 @@ def threshold_step(table: Tensor, shape: tuple[int, ...], sigma: float, profile:
         haar = haar_matrix(position.shape[1])
         stack = haar @ wavelets[position]
         small = torch.abs(stack) < profile.threshold * sigma
+        # The coefficient of the mean is never thresholded: it is not sparse, and holds the brightness.
         small[:, 0, 0] = False
         stack[small] = 0
+        # The article's weight: a stack counts inversely to the noise that its kept coefficients hold.
         weight = 1 / (sigma**2 * torch.clip(torch.count_nonzero(stack, (1, 2)), 1, None))
         add_blocks(total, weights, position, haar.T @ stack, weight)
     return total @ torch.linalg.inv(to_wavelet).T, weights
@@ -224,7 +226,9 @@ def wiener_step(table: Tensor, basic: Tensor, sigma: float, profile: Profile) ->
         haar = haar_matrix(position.shape[1])
         power = torch.square(haar @ pilot_table[position])
         gain = power / (power + sigma**2)
+        # Nor does the Wiener filter shrink the mean, which would darken the picture.
         gain[:, 0, 0] = 1
+        # Likewise: the noise behind a Wiener filter is the sum of its squared gains.
         weight = 1 / (sigma**2 * torch.square(gain).sum((1, 2)))
         stack = gain * (haar @ table[position])
         add_blocks(total, weights, position, haar.T @ stack, weight)
@@ -241,6 +245,7 @@ def add_blocks(total: Tensor, weights: Tensor, position: Tensor, stack: Tensor, 
 def aggregate(total: Tensor, weights: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return the weighted mean of all overlapping filtered blocks: an image of this shape."""
     height, width = table_size(shape)[2:]
+    # Blocks are weighted less at their borders, which would show in the picture.
     kaiser = torch.asarray(np.kaiser(BLOCK, KAISER), dtype=torch.float32)
     kaiser = torch.outer(kaiser, kaiser).reshape(-1)
     pixels = (dct_matrix().T @ total.T * kaiser[:, None]).reshape(AREA, height, width)

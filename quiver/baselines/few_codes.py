@@ -131,6 +131,7 @@ def second_order(sensor: Sensor, exposure: float, times: Times) -> tuple[Array, 
     for share, count in times:
         slope, bend, chance = _slopes(sensor, exposure * share, light * share)
         weight = np.divide(slope, chance, out=np.zeros_like(slope), where=chance > 1e-12)
+        # Light of a share s of an exposure: each derivative over full photons brings a factor s.
         above += count * share**3 * (weight * bend).sum(axis=-1)
         information += count * share**2 * (weight * slope).sum(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -162,6 +163,7 @@ def _slopes(sensor: Sensor, exposure: float, light: Array) -> tuple[Array, Array
         parts = [sensor.dcdf(part, exposure) for part in pieces(photons, sensor.levels)]
         return np.diff(np.concatenate(parts), axis=-1, prepend=0.0)
 
+    # The second derivative of a chance, as a difference of exact first ones; one-sided in the dark.
     bend = (slope_at(light + step) - slope_at(low)) / (light + step - low)[:, None]
     chance = np.concatenate([sensor.pmf(part, exposure) for part in pieces(light, sensor.levels)])
     return slope_at(light), bend, chance
@@ -212,8 +214,10 @@ def _solved(start: Array, light: Array, chance: Array) -> Array:
 
     `chance` [G, outcomes] is that of each outcome at each of the levels `light` [G].
     """
+    # Least squares: rows of bias, relative to the light, under rows that keep each change of a step small.
     weight = np.sqrt(BIAS) / (light + 0.01 * light[-1])
     steps = np.diff(start, prepend=start[0] - (start[1] - start[0]))
+    # A change of one step moves all outcomes above it alike, which keeps the estimates in order.
     rises = np.tril(np.ones((len(start), len(start)))) * steps  # of relative changes of the steps
     rows = np.concatenate([weight[:, None] * (chance @ rises), np.eye(len(start))])
     goal = np.concatenate([weight * (light - chance @ start), np.zeros(len(start))])
@@ -227,6 +231,7 @@ def _fitted_light(sensor: Sensor, exposure: float, times: Times) -> Array:
     full = np.ones_like(light)
     for share, count in times:
         full *= sensor.pmf(light * share, exposure * share)[:, -1] ** count
+    # Two conditions: top codes alone are rare, and the mean is still some deviations below its largest.
     clear = (full <= END) & (mean[-1] - mean >= CLEAR * np.sqrt(variance))
     last = max(int(np.argmin(clear)) - 1, 1) if not clear.all() else len(light) - 1
     return np.append(0.0, np.geomspace(1e-3 * light[last], light[last], LIGHTS - 1))
@@ -237,6 +242,7 @@ def _sum_chances(sensor: Sensor, exposure: float, times: Times, light: Array) ->
     size = (sensor.levels - 1) * sum(count for _, count in times) + 1
     spectrum = np.ones(1, np.complex128)
     for share, count in times:
+        # The law of a sum is the product of transforms; twice the length, so that the convolution does not wrap around.
         spectrum = spectrum * np.fft.rfft(sensor.pmf(light * share, exposure * share), 2 * size, axis=1) ** count
     return np.maximum(np.fft.irfft(spectrum, 2 * size, axis=1)[:, :size], 0.0)
 
@@ -264,6 +270,7 @@ def peak(table: Array, light: Array) -> Array:
     rows = np.arange(len(table))
     before, middle, after = (table[rows, inner + step] for step in (-1, 0, 1))
     bend = before - 2 * middle + after
+    # The vertex of the parabola through three points, in steps of the grid.
     shift = np.where(bend < 0, (before - after) / (2 * np.where(bend < 0, bend, -1.0)), 0.0)
     shift = np.where(best == inner, np.clip(shift, -1, 1), 0.0)
     spacing = np.log(light[1] / light[0])

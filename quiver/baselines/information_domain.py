@@ -77,6 +77,8 @@ def information_domain(sensor: Sensor, exposure: float) -> InformationDomain:
         # d light = 2 sqrt(light) d sqrt(light): the integrand stays finite at 0, where I may not
         steps = np.maximum(2 * np.sqrt(information * middle) * np.diff(root), LEAST)
     with np.errstate(over="ignore"):
+        # The delta method at the middles of the table's intervals; 1
+        # where all codes are alike, as for an efficient mean.
         deviation = np.where(variance > FLOOR, np.sqrt(variance) * steps / np.diff(table.mean), 1.0)
     return InformationDomain(
         photons=table.photons,

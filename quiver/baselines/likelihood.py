@@ -53,6 +53,7 @@ def restore(
         seen = seen.reshape(count, -1)
         before, answers = known.get(count, (np.empty(0, np.uint64), np.empty(0, np.float32)))
         outcome = sum((names[one] for one in seen), np.zeros(seen.shape[1], np.uint64))
+        # Most outcomes were seen in earlier frames: only new ones are solved, and inserted in order for the search.
         distinct, example, where = np.unique(outcome, return_index=True, return_inverse=True)
         new = ~np.isin(distinct, before, assume_unique=True)
         place = np.searchsorted(before, distinct[new])

@@ -158,9 +158,13 @@ def lucas_kanade(reference: Tensor, other: Tensor, corner: Tensor, shift: Tensor
         error = (template - sample_cubic(other, position, size)) * valid
         gy, gx = ((s + sample_cubic(f, position, size)) / 2 * valid for s, f in zip(slopes, flats, strict=True))
         yy, xy, xx, ye, xe = ((a * b).sum((0, 1)) for a, b in ((gy, gy), (gy, gx), (gx, gx), (gy, error), (gx, error)))
+        # The normal equations of least squares for a shift: the
+        # structure tensor times the step is gradient times error.
         det = yy * xx - xy**2
+        # A patch with one edge only tells the motion across it: its structure tensor is singular.
         moving = moving & (det > 1e-6 * (yy + xx) ** 2) & (det > 1e-12)
         step = torch.stack([xx * ye - xy * xe, yy * xe - xy * ye]) / torch.where(moving, det, 1.0)
+        # A step beyond a pixel leaves the range in which the picture is linear.
         step = step / torch.clip(torch.sqrt(torch.square(step).sum(0)), 1.0, None)
         shift = torch.where(moving, shift + step, shift)
     return shift
@@ -173,6 +177,7 @@ def candidates(parent: Tensor, down: int, across: int, fine: Level, coarse: Leve
     def parents(count: int, limit: int) -> tuple[Tensor, Tensor]:
         place = torch.arange(count) * fine.stride / (coarse.ratio * coarse.patch)
         first = torch.clip(torch.floor(place).long(), None, limit - 1)
+        # The neighbour on the side on which the patch lies: a motion boundary may run between parent and patch.
         onward = ((place - first >= 0.5) & (first + 1 < limit)) | (first == 0)
         return first, torch.clip(torch.where(onward, first + 1, first - 1), 0, limit - 1)
 

@@ -78,6 +78,7 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
     with torch.no_grad():
         pyramid = {scale: torch.stack([frame.pyramid[scale] for frame in window]) for scale in SCALES}
         codes = torch.stack([functional.avg_pool2d(frame.codes[None], SCALES[-1])[0] for frame in window])
+        # The noise that the search for paths expects, from the window without motion: only its size matters there.
         deviation = variance_of(box_mean(codes.mean(0)[None], 2)[0], domain).sqrt()
         velocity, acceleration = paths(pyramid, offsets, codes, deviation)
         moved = torch.empty(len(window), *window[0].codes.shape)
@@ -120,6 +121,7 @@ def _weighted(moved: Tensor, weight: Tensor) -> tuple[Array, Array]:
 def weights(moved: Tensor, inside: Tensor, offsets: Sequence[int], domain: InformationDomain) -> Tensor:
     """Return weights [K, H, W] of moved codes [K, H, W], 0 where not `inside`; the reference has the weight 1."""
     centre = offsets.index(0)
+    # One picture of the variance serves all frames, or frames that happen to be dim would be trusted more.
     half = functional.avg_pool2d((moved * inside).sum(0)[None] / inside.sum(0)[None], 2)
     variance = variance_of(box_mean(half, 1)[0], domain)
     weight = torch.zeros_like(moved)
@@ -129,6 +131,7 @@ def weights(moved: Tensor, inside: Tensor, offsets: Sequence[int], domain: Infor
             weight[i] = agreement(moved[i] - moved[centre], 2 * variance) * inside[i]
     near = [i for i, offset in enumerate(offsets) if abs(offset) <= 1]
     total = weight[near].sum(0)
+    # Far frames are compared with the mean of the nearest three, which has less noise than the reference alone.
     base = (weight[near] * moved[near]).sum(0) / total
     base_share = functional.avg_pool2d((1 / total)[None], 2)[0]
     for side in (-1, 1):
@@ -148,6 +151,7 @@ def agreement(difference: Tensor, variance: Tensor) -> Tensor:
     cells = functional.avg_pool2d(difference[None], 2)
     excess = torch.zeros_like(variance)
     for beside, around, tolerance, softness in STATISTICS:
+        # The mean of n pixels has the variance of one over n: its square times n over that is 1 where nothing changed.
         pixels = 4 * (2 * beside + 1) ** 2
         statistic = box_mean(box_mean(cells, beside).square() * (pixels / variance), around)[0]
         excess = torch.maximum(excess, (statistic - tolerance) / softness)

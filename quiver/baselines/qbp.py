@@ -159,6 +159,7 @@ def frame_shifts(frames: Tensor, window: range, settings: Settings = CALIBRATED)
         for i, other in enumerate(pyramids)
     ]
     times = torch.tensor([(span.start + span.stop - 1) / 2 for span in found])
+    # Matched blocks are fewer than frames: between their middles a patch moves evenly.
     shifts = _interpolate(torch.arange(len(frames)).float() - times[own], times - times[own], torch.stack(moves))
     return shifts - shifts[middle]
 
@@ -238,6 +239,7 @@ def _merge_patches(
     own = counts[middle]
     smooth = settings.refine_finest
     reference = _warp_block(*blocks[middle], corner, smooth)
+    # The variance of a coefficient of an unnormalised transform of size^2 pixels of white noise is size^2 times theirs.
     noise = size * size * settings.wiener * _noise(reference, own, table, unit, settings)
     spectrum = torch.fft.rfft2(reference, None, (0, 1))
     total = own * spectrum
@@ -247,6 +249,8 @@ def _merge_patches(
         other = torch.fft.rfft2(_warp_block(*block, corner, smooth), None, (0, 1))
         other -= spectrum
         power = torch.square(other.real) + torch.square(other.imag)
+        # Noise of the reference, plus that of the other block, whose mean
+        # of `count` frames has own / count of its variance.
         both = noise * (1 + own / count)  # of the difference
         total += count * (spectrum + other * (both / (power + both)))  # A F0 + (1 - A) Fz, A = power / (power + both)
     patches = torch.fft.irfft2(total / sum(counts), (size, size), (0, 1))
@@ -262,6 +266,7 @@ def _noise(reference: Tensor, frames: int, table: Response, unit: float, setting
         spread = reference - reference.mean((0, 1))
         return torch.clip(torch.square(spread).sum((0, 1)) / (size**2 - 1), EPSILON, None)
     mean_code = np.asarray(unit * reference.mean((0, 1)))
+    # The sensor's law gives the noise at the patch's mean, however much the patch varies by its picture.
     variance = np.interp(mean_code, table.mean, table.variance) / (frames * unit**2)
     return torch.asarray(np.maximum(variance, EPSILON), dtype=torch.float32)
 
@@ -271,6 +276,7 @@ def overlap_add(patches: Tensor, corner: Tensor, shape: tuple[int, ...]) -> Tens
     size = patches.shape[0]
     width = shape[1]
     step = torch.arange(size)
+    # Raised cosines at half their width apart add up to 1; the division below is for patches at the border alone.
     one = 0.5 - 0.5 * torch.cos(2 * torch.pi * (step.float() + 0.5) / size)
     weight = torch.outer(one, one)[..., None]
     index = ((corner[0] + step[:, None]) * width)[:, None] + (corner[1] + step[:, None])[None]

@@ -103,10 +103,12 @@ def stabiliser(sensor: Sensor, exposure: float, times: tuple[int, ...], kind: Ki
     match kind:
         case "table":
             slope = 1 / np.sqrt(np.maximum(table.variance, FLOOR))
+            # The integral of 1 / sqrt(V) over the mean code, by the trapezoidal rule.
             area = np.cumsum(np.diff(table.mean) * (slope[1:] + slope[:-1]) / 2)
             stabilised = np.interp(mean_code, table.mean, np.concatenate([[0.0], area]))
         case "binomial":  # deviation 1/2 for the sum of N bits; scaled to that of a mean of codes
             bits = samples * top
+            # Anscombe (1948): arcsin sqrt((x + 3/8) / (n + 3/4)) has a variance of nearly 1 / (4 n + 2).
             share = (mean_code * samples + 0.375) / (bits + 0.75)
             stabilised = 2 * np.sqrt((bits + 0.5) / samples) * np.arcsin(np.sqrt(share))
         case "poisson":  # deviation 1 for the sum of electrons
@@ -117,6 +119,7 @@ def stabiliser(sensor: Sensor, exposure: float, times: tuple[int, ...], kind: Ki
     photons = np.linspace(0, np.sqrt(table.cap(samples)), POINTS) ** 2
     excess = (sum(count * count for count in times) / samples) ** 0.5
     if sensor.many_codes:  # their mean is nearly normal
+        # Gauss-Hermite quadrature of E f over the normal law of the mean.
         nodes, weights = np.polynomial.hermite_e.hermegauss(NODES)
         mean, variance = sensor.moments(photons, exposure)
         deviation = np.sqrt(variance / samples) * excess

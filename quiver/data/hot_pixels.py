@@ -114,7 +114,11 @@ def scan(codes: Codes) -> Scan:
     length, height, width = codes.shape
     nothing = Scan(np.zeros((height, width), bool), 0, 0.0)
     times = min(TIMES, length)
-    rows, columns = (1, 1) if codes.colour is None else codes.colour.tile
+    rows = 1
+    columns = 1
+    if codes.colour is not None:
+        rows, columns = codes.colour.tile
+    # Codes of a schedule are exposed for different times: that changes every pixel, and no scene has moved.
     if times < FEWEST or min(height // rows, width // columns) < AROUND or codes.shares is not None:
         return nothing
     each = min(FRAMES, length // times)
@@ -159,10 +163,12 @@ class _Seen:
         typical = np.maximum(uniform_filter(means.mean(axis=0), 3, mode="reflect"), ring)  # of few counts a median errs
         noise = np.interp(typical, mean_code, variance) / frames + least
         own = np.interp(means.mean(axis=0), mean_code, variance) / frames + least
-        beside = np.pi / 16 * noise  # of a median of eight
+        # The median of n normal values has about pi / 2 times the variance of their mean: pi / 2 / 8 for eight.
+        beside = np.pi / 16 * noise
         excess = means - ring
         mean_excess = excess.mean(axis=0)
         shot = (noise + beside).mean(axis=0) / len(means)
+        # What a texture alone makes of a pixel beside its neighbours is measured around it, not assumed.
         spread = np.sqrt(_robust_square(mean_excess) + shot)
         stands_out = mean_excess > OUTLIER * spread
         dark_enough = ring < 0.85 * mean_code[-1]  # beside saturated neighbours no excess is left
@@ -172,13 +178,14 @@ class _Seen:
         clean_noise = np.interp(near.mean(axis=0), mean_code, variance) / frames + least
         little = near.mean(axis=0) * frames * FEW_PIXELS < FEW_COUNTS
         around = np.where(little, near, ring)
+        own_noise = own.mean(axis=0) if own.ndim == 3 else own
         return cls(
             stands_out,
             bright,
             _moving(means, ring, own) | (little & _moving_in_little_light(clean, clean_noise)),
             ~_follows(means, ring, own, beside),
             _shared(means, around, own, np.where(little, clean_noise / pixels, beside), response),
-            _adding(means, stands_out, own.mean(axis=0) if own.ndim == 3 else own, response, frames),
+            _adding(means, stands_out, own_noise, response, frames),
         )
 
     @property
@@ -194,6 +201,7 @@ class _Seen:
         """
         alike = self.alike
         odds = self.added[alike]
+        # Expectation maximisation of the share: each pixel's chance by Bayes' rule, then the mean of these chances.
         share = LIKELY
         for _ in range(ROUNDS):
             chance = expit(odds + logit(share))
@@ -211,6 +219,8 @@ class _Seen:
         left = int((self.stands_out & self.moving & ~self.bright).sum())  # bright points of the scene
         if count < ENOUGH or count < MOSTLY * (count + left) or not self._apart_together(candidates):
             return proven
+        # Hot pixels lie evenly over the sensor, lamps where the scene has them: in the still part, bright pixels beyond
+        # the share of the moving part are lamps. Their number is Poisson, whose deviation is the root of its mean.
         still = int((self.bright & ~self.moving).sum())
         expected = count / int(self.moving.sum()) * int((~self.moving).sum())
         if still > MANY * expected + SURE * np.sqrt(max(expected, 1.0)):
@@ -221,6 +231,7 @@ class _Seen:
         """Return whether some pixels, taken together, surely follow less than TOGETHER of what changes around them."""
         sums = self.followed[:, :, candidates].sum(axis=2)
         for (shared, around, noise), terms in zip(sums, (TIMES - 1, SLOW), strict=True):
+            # Noise adds its mean to a sum of squares; that of n normal values has the relative deviation root(2 / n).
             changes = around - noise
             measured = changes >= SURE * noise * np.sqrt(2 / (int(candidates.sum()) * terms))
             if measured and shared + SURE * np.sqrt(around) < TOGETHER * changes:
@@ -272,12 +283,14 @@ def _moving_in_little_light(means: Array, noise: Array) -> Array:
     for one, other in (((-1, 0), (1, 0)), ((0, -1), (0, 1))):
         sides = [_side(means, *side, width, depth) for side in (one, other)]
         beside = sum(_side(noise[None], *side, width, depth)[0] for side in (one, other)) / (width * depth)
+        # Light that falls or rises everywhere changes the difference of two sides in proportion to it: no motion.
         middle = (sides[0] - sides[1]).mean(axis=0)
         left = sides[0] - sides[1] - middle
         most = SLACK * np.abs(middle) / np.maximum(level.mean(axis=0), 1e-6)
         slope = np.clip((change * left).sum(axis=0) / np.maximum((change**2).sum(axis=0), 1e-12), -most, most)
         slow = dct(left - slope * change, axis=0, norm="ortho")[1 : SLOW + 1]
         squares += (slow**2).mean(axis=0) / beside / 2
+    # A pixel moves if the squares on all four of its sides did: the least of them counts.
     pooled = _box(squares, WIDE) / WIDE**2
     far = np.pad(pooled, AWAY, mode="reflect")
     height, width = pooled.shape
@@ -306,14 +319,17 @@ def _adding(means: Array, out: Array, own: Array, response: Response, frames: in
     def ordinary(values: Array) -> Array:
         return np.asarray(_box(values * good, PREDICTED) / pixels)
 
+    # The usual slope of a pixel's change over its neighbours', by least squares over all times and pixels around.
     predicted = np.clip(ordinary(products) / np.maximum(ordinary(squares), 1e-12), 0.0, 1.0)
     left = (change**2).sum(axis=0) - 2 * predicted * products + predicted**2 * squares
     shot = np.interp(level, response.mean, response.variance) / frames
     structure = np.maximum(ordinary(left) / (len(means) - 1) - ordinary(shot), 0.0)
     rise = np.gradient(response.mean, response.photons)
-    slopes = [np.interp(codes, response.mean, rise) for codes in (means.mean(axis=0), level)]
-    factor = slopes[0] / np.maximum(slopes[1], 1e-12)  # codes near the top change less
+    own_rise = np.interp(means.mean(axis=0), response.mean, rise)
+    rise_around = np.interp(level, response.mean, rise)
+    factor = own_rise / np.maximum(rise_around, 1e-12)  # codes near the top change less
     slope = predicted * factor
+    # Log of the ratio of two normal laws of the same variance, with means slope * around and 0, summed over the times.
     return np.asarray((slope * products - slope**2 * squares / 2) / (own + structure * factor**2))
 
 
@@ -336,6 +352,7 @@ def _moving(means: Array, ring: Array, own: Array) -> Array:
     A change of the whole frame, as at dusk, and one that all neighbours share, as a shadow, are no motion. Sides are
     narrow, or in little light wide.
     """
+    # The median of a frame follows the light of the whole scene, and hardly what moves in a part of it.
     whole = np.broadcast_to(np.median(ring, axis=(1, 2))[:, None, None], ring.shape)
     found = [_crossed(means, ring, own, whole, *size) for size in SIDES]
     return np.asarray(np.logical_or.reduce(found))
@@ -343,7 +360,7 @@ def _moving(means: Array, ring: Array, own: Array) -> Array:
 
 def _crossed(means: Array, ring: Array, own: Array, whole: Array, width: int, depth: int) -> Array:
     """Return the same by sides of `width` x `depth` pixels."""
-    degrees = len(means) - 2
+    degrees = len(means) - 2  # a mean and a slope are fitted
     sides = {side: _side(means, *side, width, depth) for side in ((-1, 0), (1, 0), (0, -1), (0, 1))}
     noise = {side: _side(own[None], *side, width, depth)[0] / (width * depth) for side in sides}
     changed = [_left(values, whole, noise[side], least=1.0) for side, values in sides.items()]
@@ -351,15 +368,20 @@ def _crossed(means: Array, ring: Array, own: Array, whole: Array, width: int, de
         _left(sides[one] - sides[other], ring, noise[one] + noise[other])
         for one, other in (((-1, 0), (1, 0)), ((0, -1), (0, 1)))
     ]
+    # The larger of two squares exceeds its limit twice as often: each has half of the chance.
     different = np.maximum(*across) > chi2.isf(CHANGED / 2, degrees)
     return np.asarray(different & (np.minimum.reduce(changed) > chi2.isf(CHANGED, degrees)))
 
 
 def _side(means: Array, dy: int, dx: int, width: int, depth: int) -> Array:
     """Return the mean of the pixels on one side of every pixel, `depth` rows of `width`, [K, H, W]."""
-    along, away = (2, 1) if dy else (1, 2)
+    along = 2 if dy else 1
+    away = 1 if dy else 2
     rows = np.zeros(2 * depth + 1)
-    rows[slice(0, depth) if dy + dx < 0 else slice(depth + 1, None)] = 1 / depth
+    if dy + dx < 0:
+        rows[:depth] = 1 / depth
+    else:
+        rows[depth + 1 :] = 1 / depth
     mean = uniform_filter1d(means, width, axis=along, mode="reflect")
     return np.asarray(correlate1d(mean, rows, axis=away, mode="reflect"))
 
@@ -379,6 +401,7 @@ def _left(values: Array, law: Array, variance: Array, least: float = 0.0) -> Arr
 
 def _follows(means: Array, ring: Array, own: Array, beside: Array) -> Array:
     """Return where the light of a pixel may be a constant multiple of that of its neighbours, bool [H, W]."""
+    # Of y = ratio x, with noise in both, y - ratio x has the variance of y plus ratio^2 times that of x.
     ratio = (means * ring).sum(axis=0) / np.maximum((ring**2).sum(axis=0), 1e-12)
     left = ((means - ratio * ring) ** 2 / (own + ratio**2 * beside)).sum(axis=0)
     return np.asarray(left < chi2.isf(CHANGED, len(means) - 1))
@@ -392,12 +415,17 @@ def _shared(means: Array, ring: Array, own: Array, beside: Array, response: Resp
     they are to the top.
     """
     rise = np.gradient(response.mean, response.photons)
-    levels = means.mean(axis=0), ring.mean(axis=0)
-    light, around = (np.interp(level, response.mean, response.photons) for level in levels)
-    slope, slope_around = (np.interp(level, response.mean, rise) for level in levels)
+    level = means.mean(axis=0)
+    level_around = ring.mean(axis=0)
+    light = np.interp(level, response.mean, response.photons)
+    around = np.interp(level_around, response.mean, response.photons)
+    slope = np.interp(level, response.mean, rise)
+    slope_around = np.interp(level_around, response.mean, rise)
     ratio = light / np.maximum(around, 1e-6) * slope / np.maximum(slope_around, 1e-12)
-    expected = dct(ratio * (ring - levels[1]), axis=0, norm="ortho")[1:]
-    change = dct(means - levels[0], axis=0, norm="ortho")[1:]
+    # The orthonormal cosine transform keeps the variance of white noise and sorts changes by their speed. Its first
+    # entry, the mean, is no change.
+    expected = dct(ratio * (ring - level_around), axis=0, norm="ortho")[1:]
+    change = dct(means - level, axis=0, norm="ortho")[1:]
     noise = np.broadcast_to((ratio**2 * beside).mean(axis=0), change.shape)
     terms = np.stack([change * expected, expected**2, noise])
     return np.stack([terms.sum(axis=1), terms[:, :SLOW].sum(axis=1)]) / own

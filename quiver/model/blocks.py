@@ -142,6 +142,7 @@ class FlowNetwork(nn.Module):
         flow = reference.new_zeros(reference.shape[0], 2, padded[0] // coarsest, padded[1] // coarsest)
         flows = []
         for level, pair in zip(self.levels, pyramid, strict=True):
+            # Twice as many pixels: a flow in pixels doubles.
             up = 2 * F.interpolate(flow, scale_factor=2, mode="bilinear", align_corners=True)
             warped = warp(pair[:, 1:], up, "border")
             flow = level(join(pair[:, :1], warped.to(up.dtype), up)) + up
@@ -150,6 +151,7 @@ class FlowNetwork(nn.Module):
 
     @staticmethod
     def _to_size(flow: Tensor, height: int, width: int) -> Tensor:
+        # Each component is resized as its own axis is.
         scale = flow.new_tensor((width / flow.shape[3], height / flow.shape[2])).view(1, 2, 1, 1)
         return resize(flow, height, width) * scale
 
@@ -214,6 +216,7 @@ class Alignment(nn.Module):
         last = self.offsets[-1]
         assert isinstance(last, nn.Conv2d)
         assert last.bias is not None
+        # An untrained alignment follows the flow alone: no offset of its own, and a mask of 1/2.
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
 
@@ -221,6 +224,7 @@ class Alignment(nn.Module):
         """Features [N, C, h, w] of frames t-1 and t, flow [N, 2, h, w] -> aligned features [N, C, h, w]."""
         warped = warp(previous, flow, "zeros")
         raw = self.offsets(join(warped.to(current.dtype), current, flow))
+        # Offsets in (dy, dx) for each tap; the flow comes as (x, y) and is flipped.
         own = OFFSET_LIMIT * torch.tanh(raw[:, : 2 * self.pairs])
         offset = own + flow.flip(1).repeat(1, self.pairs, 1, 1)
         mask = torch.sigmoid(raw[:, 2 * self.pairs :])
@@ -305,6 +309,7 @@ class TemporalAttention(nn.Module):
         centre = len(window) // 2
         c = self.enter(join(*window[:centre], *window[centre + 1 :], window[centre]))
         q, k, v = self.qkv(self.spread(c)).flatten(2).chunk(3, dim=1)
+        # Attention between channels, not pixels (Restormer, Zamir et al. 2022): its cost is linear in the pixels.
         cosines = F.normalize(q, dim=2) @ F.normalize(k, dim=2).transpose(1, 2)  # of every pair of channels
         attended = (cosines.softmax(dim=2) @ v).view_as(c)
         return self.leave(self.project(attended) + c)

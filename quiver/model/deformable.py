@@ -82,6 +82,7 @@ def deform_conv2d(  # noqa: PLR0913 (settings of a public function)
         y, x = _positions(offset, weight.shape[2:], groups, stride, padding, dilation)
         strength = None if mask is None else mask.to(dtype).view(count, groups, 1, taps, *out_size)
         if tap_loop is None:
+            # All taps at once keep K samples of each pixel in memory; one after the other, a single one.
             large = count * channels * taps * out_size[0] * out_size[1] > TAP_LOOP_ABOVE
             tap_loop = large and not torch.is_grad_enabled()
         step = 1 if tap_loop else taps
@@ -145,6 +146,7 @@ def _contract(samples: Tensor, weight: Tensor, part: slice) -> Tensor:
 def sample_at(image: Tensor, x: Tensor, y: Tensor, padding: str) -> Tensor:
     """Sample an image [N, C, H, W] at pixel positions x, y [N, h, w] -> [N, C, h, w]."""
     height, width = image.shape[2:]
+    # grid_sample counts from -1 to 1 over the picture with its outer edges.
     grid = torch.stack(((2 * x + 1) / width - 1, (2 * y + 1) / height - 1), dim=-1)
     return F.grid_sample(image, grid, mode="bilinear", padding_mode=padding, align_corners=False)
 

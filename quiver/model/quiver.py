@@ -159,6 +159,7 @@ class QUIVER(nn.Module):
             by_time = [e.view(frames.shape[0], -1, *e.shape[1:]).unbind(1) for e in encoded]
             for t, (full, half, entry) in enumerate(zip(*by_time, strict=True), start=len(entries)):
                 entries.append(entry)
+                # Only frames with a complete window are restored, so only theirs is kept.
                 if RADIUS <= t < length - RADIUS:
                     r1[t] = full
                     r2[t] = half

@@ -207,6 +207,8 @@ class Trainer:
         self.process = process
         self.optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
         self.state = run.load(model, self.optimiser)
+        # Parameters that a loss does not use at some step (a teacher, a turned-off part)
+        # have no gradient; processes wait for all gradients unless told to look.
         objective = Objective(model, system.loss, settings)
         self.parallel = (
             nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
@@ -241,6 +243,7 @@ class Trainer:
             self._fail(batch, norm)
         self.optimiser.step(self.rate)
         state.step = state.step + 1
+        # The learning rate follows the time, so all processes need the same one.
         state.elapsed = self.process.from_leader(time.monotonic() - self.started)
         if self.board is not None:
             self.board.step(state, self.loss, norm, self.rate)
@@ -260,6 +263,8 @@ class Trainer:
         """Determine whether the run ends with this step; validate then, and whenever a validation is due."""
         settings = self.run.settings
         state = self.state
+        # One process decides for all: clocks differ, and a process that
+        # went on alone would wait forever for the others.
         out_of_time = self.process.any(time_is_up(settings, state, self.validation))
         state.finished = state.step == settings.steps or out_of_time
         if not self.process.any(validation_due(settings, state)) and not state.finished:
@@ -355,6 +360,7 @@ def train(
         conditions = {"processes": process.world, "computes_in": precision_of(settings, process.device)}
         begun = not force and (Path(settings.out) / "settings.json").is_file()
         run = Run(settings, conditions | {"clips": source_digest(windows, fixed), "validated_frames": validated})
+        # Made once for its errors: settings that do not fit must not cost the run that `force` removes.
         Optimiser(model.to(process.device), settings.optimiser, settings.learning_rate, settings.betas)
         if process.leads:
             importlib.import_module("torch.utils.tensorboard")  # this and the line above fail before a run is removed

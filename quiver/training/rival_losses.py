@@ -82,6 +82,7 @@ def emvd_loss(network: Any, batch: Batch, settings: Settings, share: float) -> T
     taps = network.ft.net1["weight"].view(2, 2)
     inverse = torch.stack([network.fti.net1["weight"].flatten(), network.fti.net2["weight"].flatten()])
     with torch.autocast(error.device.type, enabled=False):
+        # Perfect reconstruction: analysis times synthesis is the identity.
         product = taps @ inverse if network.config.as_published else taps.T @ inverse
         return error + _from_identity(colour @ back) + _from_identity(product)
 
@@ -114,6 +115,7 @@ def flornn_loss(network: Any, batch: Batch, settings: Settings, share: float) ->
     moved = warp(later, flows.forward.flatten(0, 1).float(), "border")
     back = warp(earlier, flows.backward.flatten(0, 1).float(), "border")
     photometric = (moved - earlier).abs().mean() + (back - later).abs().mean()
+    # Squares are summed over frames and pixels; the mean photometric error is brought to that size.
     return squares + PHOTOMETRIC * restored.shape[1] * photometric * codes.shape[-2] * codes.shape[-1]
 
 

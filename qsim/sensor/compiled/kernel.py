@@ -169,8 +169,10 @@ def _count(
             steps, unit = _steps(sums, mean, scalars)
             code, near = _search(steps, uniform32(word) * unit)
             codes.append(code)
+            # Written so that NaN counts as uncertain, and is named by the reference.
             uncertain |= ~(near >= margin * unit)
         return codes, uncertain
+    # All planes of a code have the same light, so their one step is computed once.
     nothing = [_steps(sums, mean, scalars)[0][0] for mean in arrivals]
 
     def add_plane(plane: Any, near: Any, *counts: Any) -> tuple[Any, ...]:
@@ -215,6 +217,7 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
         result = []
         for k in range(len(steps.shares)):
             live = smaller(mean * scalars[k], real(_CERTAIN))
+            # Horner's scheme of the sum of live^n / n! up to k: all terms are positive, and nothing cancels in float32.
             total = real(1)
             for n in range(k, 0, -1):
                 total = dr.fma(total, live * (1 / n), 1)
@@ -225,6 +228,8 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
     full = scalars[2 : 2 + n]
     bands = iter(scalars[2 + n :])
     mean = smaller(mean, highest)
+    # Terms are Poisson probabilities times exp(mean), so that the recursion starts at 1; of bright
+    # means exp would overflow float32, and half of the exponent is left to the first term.
     unit = dr.exp(mean * 0.5 if steps.halved else mean)
     grow = mean * scale
     terms = [1 / unit if steps.halved else real(1)]

@@ -67,6 +67,7 @@ def _afterpulses(
     if not probability or before is None:
         return plane, plane
     released = uniform(words(_step(key, _AFTERPULSE), plane.shape, origin)) < probability
+    # A released carrier fires a pixel that did not fire anyway; a plane has one bit.
     after = plane | (before & released.astype(plane.dtype))
     after = after if dead is None else np.where(dead, plane.dtype.type(0), after)
     return after, after
@@ -91,9 +92,11 @@ def _crosstalk(
         u = uniform(words(_step(key, _CROSSTALK + number), codes.shape, origin))
         sent = np.zeros(codes.shape, np.int64)
         j = 0
+        # Binomial(n, probability) by inversion: count the steps of its cdf below u.
         while (more := (j < codes) & (u >= bdtr(j, np.maximum(codes, 1), probability))).any():
             sent = sent + more
             j = j + 1
+        # Avalanches sent beyond the edge of the frame leave it.
         target = (slice(max(dy, 0), height + min(dy, 0)), slice(max(dx, 0), width + min(dx, 0)))
         source = (slice(max(-dy, 0), height + min(-dy, 0)), slice(max(-dx, 0), width + min(-dx, 0)))
         total[target] += sent[source]

@@ -125,6 +125,8 @@ def _follow_pixels(
     frames, _, height, width = photons.shape
     codes = np.empty((frames, height, width), sensor.dtype)
     for y, x in np.ndindex(height, width):
+        # A stream of random numbers for each pixel: how many a pixel takes
+        # depends on its history, so no counter could name them.
         rng = pixel_stream(key, y + origin[0], x + origin[1])
         counts = simulate(sensor, photons[:, :, y, x], exposure, frame_time, memory, rng)
         codes[:, y, x] = np.minimum(counts, sensor.levels - 1)
@@ -142,6 +144,7 @@ def effects(sensor: CountingSPAD, photons: Array, exposure: float, frame_time: f
     rates = sensor.efficiency * np.asarray(photons, float) + sensor.dark_rate * exposure / slices
     arrivals = rates.sum(axis=1)
     share = sensor.dead_time / exposure
+    # With n = sum of the slices: S sum n_i^2 - n^2 = c^2 n^2, where c is the coefficient of variation of the flux.
     spread = slices * (rates**2).sum(axis=1) - arrivals**2  # c^2 lambda^2
     varying = share * np.divide(spread, arrivals, out=np.zeros_like(arrivals), where=arrivals > 0)
     if sensor.paralyzable:
@@ -212,6 +215,7 @@ def expose(
 ) -> tuple[int, State]:
     """Return the count of one exposure and the state after it; arrivals [s] and released carriers in time order."""
     waiting = [*arrivals, *(time for time in state.trapped if time >= start)]
+    # A carrier is known by the time of its release. Two equal times have probability 0.
     carriers = set(state.trapped)
     heapify(waiting)
     count = 0
@@ -226,6 +230,7 @@ def expose(
                 heappush(waiting, release)
         if log is not None:
             log.append((time, DETECTED * live + RELEASED * (time in carriers)))
+        # A paralyzable pixel begins a new dead time with every avalanche, counted or not.
         if live or sensor.paralyzable:
             dead_until = time + sensor.dead_time
     return count, State(dead_until, tuple(waiting))

@@ -59,6 +59,8 @@ class PixelArray:
                 )
             name = key.removesuffix("_map")
             if name == "dark":
+                # A map of dark rates is kept relative to a rate of the sensor,
+                # so that one factor per pixel scales its law.
                 rate, full = measured_dark_map(full)
                 sensor = sensor.with_dark_rate(rate)
             elif name == "read_noise" and isinstance(sensor, QIS):
@@ -88,6 +90,7 @@ class PixelArray:
         """Return the number of earlier frames beyond which an influence has at most this probability."""
         if not (self.memory and isinstance(self.sensor, BinarySPAD)):
             return 0
+        # An influence survives a plane with the probability of an afterpulse: a^(frames planes) <= chance.
         return ceil(log(chance) / log(self.defects.afterpulse) / self.sensor.planes)
 
     def crop(self, y: int, x: int, height: int, width: int) -> PixelArray:
@@ -169,6 +172,7 @@ class PixelArray:
         codes = np.zeros(photons.shape, self.sensor.dtype)
         for p in range(len(photons) * m):
             at = key.at(key.frame * m + p)
+            # Planes are drawn one by one, since each may be disturbed by the one before: their sum has no closed law.
             fired = plane._independent(photons[p // m][None] / m, exposure / m, at, origin, engine)
             fired, before = noise.disturb(before, fired, 1, at, self.maps.dead, origin)
             codes[p // m] += fired[0]

@@ -114,6 +114,7 @@ class EMVD(nn.Module):
             gamma = result.gamma
             if scale:
                 up = self.fti(result.denoised)
+        # The last step weighs what was fused against what was denoised, pixel by pixel.
         omega = self.refine(torch.cat([result.fused, result.denoised, result.variance], dim=1))
         refined = torch.lerp(result.denoised, result.fused, omega)
         return self.cti(self.fti(refined)), self.cti(self.fti(result.fused))
@@ -149,6 +150,7 @@ class Scale(nn.Module):
         coarser = [] if gamma is None else [gamma.repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)]
         gamma = self.fusion(torch.cat([(new_low - old_low).abs(), *coarser, new_noise], dim=1))
         fused = torch.lerp(old, new, gamma)
+        # Independent noise of two frames, mixed by gamma: squares of the weights.
         variance = (1 - gamma) ** 2 * old_noise + gamma**2 * new_noise
         images = [] if up is None else [up]
         return Fused(gamma, fused, variance, self.denoise(torch.cat([fused, *images, new_low, variance], dim=1)))

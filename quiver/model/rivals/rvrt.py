@@ -237,6 +237,7 @@ def reduced(images: Tensor) -> Tensor:
 def composed(steps: Tensor) -> Guides:
     """Flows [B, 3, 2, h, w] between neighbours of four frames, on j+1 into j -> guides of frames 2, 3 into 0, 1."""
     f10, f21, f32 = steps.unbind(1)
+    # Flows are composed: from frame 2 to frame 1, and from where that ends on to frame 0.
     f20 = f21 + warp(f10, f21)
     f31 = f32 + warp(f21, f32)
     f30 = f32 + warp(f20, f32)
@@ -346,6 +347,8 @@ class SwinLayer(nn.Module):
         rows = x.shape[2] // window[0]
         columns = x.shape[3] // window[1]
         cut = x.view(count, frames, rows, window[0], columns, window[1], channels).permute(0, 2, 4, 1, 3, 5, 6)
+        # Rolling brings opposite edges of the image into one window; their
+        # pixels must not see each other (Swin, Liu et al. 2021).
         regions = _regions(cut.shape[1:6], shift, x.device) if any(shift) else None
         done = self.attn(cut.reshape(count, rows * columns, -1, channels), window, regions)
         joined = done.view(cut.shape).permute(0, 3, 1, 4, 2, 5, 6).reshape(x.shape)
