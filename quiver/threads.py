@@ -2,7 +2,7 @@
 
 Two threads on busy cores can be many times slower than one.
 
-    --threads N, else the number of the resumed run, else the faster of one thread and of all, by a small convolution
+    the given number, else that of the resumed run, else the faster of one thread and of all, by a small convolution
 
 OpenMP's threads wait for each other by spinning, unless OMP_WAIT_POLICY is set before torch is loaded. On a core that
 another process needs, each wait then lasts until the scheduler intervenes. So commands set it to PASSIVE.

@@ -88,5 +88,5 @@ def played(scene: Scene, file: str | Path) -> str:
     name = scene.bodies[-1].name.partition(", part ")[0]
     return (
         f"plays the animation {name} of {clocks[0].length:g} s at {clocks[0].speed:g} times its speed, again and "
-        "again; --seed chooses among those of the file, a scene in Python (animated_file) anything else"
+        "again; the seed chooses among those of the file, a scene in Python (animated_file) anything else"
     )

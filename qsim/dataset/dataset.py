@@ -36,7 +36,7 @@ NAMED = 1000  # unfinished clips that a check names one by one
 
 
 class Damaged(ValueError):
-    """dataset.json differs from what was written; `qsim generate --repair` writes it again."""
+    """dataset.json differs from what was written; repairing the data set writes it again."""
 
 
 @dataclass(frozen=True, kw_only=True)

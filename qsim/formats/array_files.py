@@ -112,7 +112,7 @@ def read_codes_npy(path: Path, hints: Hints) -> Recording:
 
 
 def read_light_npy(path: Path, hints: Hints) -> Recording:
-    """Read numbers [T, H, W] as light: integers by --transfer (full scale of their type), floats are linear."""
+    """Read numbers [T, H, W] as light: integers by `transfer` (full scale of their type), floats are linear."""
     array = load_array(path)
     return light_of(path, Values(array.shape, array.dtype, lambda index: array[index]), ".npy", hints)
 
@@ -120,7 +120,7 @@ def read_light_npy(path: Path, hints: Hints) -> Recording:
 def codes_of(
     path: Path, values: Values, form: str, hints: Hints, *, stated: str | None = None, bits: int | None = None
 ) -> Recording:
-    """Return an array as codes of one bit (bool) or of the stated bits; its axes by --axes, else as `stated`."""
+    """Return an array as codes of one bit (bool) or of the stated bits; its axes by `axes`, else as `stated`."""
     reading = axes.named(path, values.shape, hints, stated)
     if reading.colour:
         raise ValueError(f"{path}: colours hold no codes; name the axis of channels C, and choose one with channel=")
@@ -139,7 +139,7 @@ def codes_of(
 
 
 def light_of(path: Path, values: Values, form: str, hints: Hints) -> Recording:
-    """Return an array as light, in colour as luminance; its axes by --axes."""
+    """Return an array as light, in colour as luminance; its axes by `axes`."""
     reading = axes.named(path, values.shape, hints)
     full_shape = reading.shape(values.shape)
     if reading.colour and full_shape[3] != 3:

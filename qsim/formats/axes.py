@@ -53,7 +53,7 @@ class Reading:
 
 
 def named(path: Path, sizes: tuple[int, ...], hints: Hints, stated: str | None = None) -> Reading:
-    """Return how axes of these sizes are read: by --axes, else as the file has `stated` them, else [T, Y, X].
+    """Return how axes of these sizes are read: by `axes`, else as the file has `stated` them, else [T, Y, X].
 
     `ValueError` names the axes of which one index must be chosen.
     """

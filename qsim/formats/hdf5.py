@@ -18,9 +18,9 @@ LISTED = 20  # datasets that a message names
 
 
 def read_hdf5(path: Path, hints: Hints) -> Recording:
-    """Read a dataset of numbers: codes of --bits (1 for bool), or light (floats, or with --transfer or --white).
+    """Read a dataset of numbers: codes of `bits` (1 for bool), or light (floats, or with `transfer` or `white`).
 
-    Without --dataset the only array of two or more axes is read. `ValueError` for a dataset behind a link or in other
+    Without `dataset` the only array of two or more axes is read. `ValueError` for a dataset behind a link or in other
     files, which could be any file.
     """
     import h5py

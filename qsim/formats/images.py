@@ -118,7 +118,7 @@ def turned(pixels: Array, orientation: int) -> Array:
 def read_tiff(path: Path, hints: Hints) -> Recording:
     """Read a TIFF with one page per frame, or a folder of TIFFs; MinIsWhite is converted to MinIsBlack.
 
-    `ValueError` for other colours than grey and RGB, unless the pixels of a palette are codes (--bits).
+    `ValueError` for other colours than grey and RGB, unless the pixels of a palette are codes (`bits`).
     """
     found = [path] if path.is_file() else _files(path, ".tif", ".tiff")
     if not found:
@@ -141,7 +141,7 @@ def read_tiff(path: Path, hints: Hints) -> Recording:
 
 
 def picture(path: Path, shape: tuple[int, int, int], raw: Any, first: Page, form: str, hints: Hints) -> Recording:
-    """Return pictures as codes if they have 1 bit or --bits is given, else as light by --transfer.
+    """Return pictures as codes if they have 1 bit or `bits` is given, else as light by `transfer`.
 
     Pictures of 2 to 7 bits are codes of their depth unless a transfer curve or a white is given. `ValueError` if codes
     exceed 2^bits - 1, as codes stretched to 0 ... 255 do.

@@ -30,9 +30,9 @@ from qsim.clip.source import Source
 from qsim.files import decoding_errors
 from qsim.formats.recording import Hints, Recording
 from qsim.kinds import Positive, Whole
-from qsim.records import convert
+from qsim.records import convert, plain
 from qsim.sensor.defects.event_simulation import DETECTED, RELEASED
-from qsim.streams.rows import Rows, from_dict
+from qsim.streams.rows import Rows
 from qsim.streams.storing import stored
 from qsim.streams.stream import Stream
 
@@ -175,7 +175,7 @@ def write(stream: Stream, path: Path) -> int:
     if not np.array_equal(np.minimum(found.counts(), stream.sensor.levels - 1), stream.codes()):
         raise ValueError(f"{stream.path}: its codes are not the counts of its photons; sense it again and replace it")
     meta = {"format": FORMAT, "shape": [frames, height, width], "exposure": stream.exposure, "frame_rate": rate}
-    rows = {} if stream.rows is None else {"rows": stream.rows.to_dict()}
+    rows = {} if stream.rows is None else {"rows": plain(stream.rows, complete=True)}
     text = files.to_json(meta | {"sensor": stream.info.sensor} | rows)
     with files.replacing(path) as file:
         np.savez(file, times=times, kind=kind, first=first, meta=np.frombuffer(text, np.uint8))
@@ -195,7 +195,7 @@ def read(path: Path) -> PhotonTimes:
         rate = about["frame_rate"]
         if not exposure * rate < 1 + 1e-9:
             raise ValueError(f"{path}: an exposure of {exposure!r:.40} s at {rate!r:.40} frames per second")
-        rows = from_dict(meta["rows"], f"{path}: rows") if "rows" in meta else None
+        rows = convert(meta["rows"], Rows, f"{path}: rows") if "rows" in meta else None
         events = (found["times"], found["kind"], found["first"])
         photons = PhotonTimes(shape, exposure, rate, *events, rows=rows)
         _check(path, photons)

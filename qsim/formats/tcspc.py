@@ -44,7 +44,7 @@ def read_ptu(path: Path, hints: Hints) -> Recording:
 
 
 def read_sdt(path: Path, hints: Hints) -> Recording:
-    """Read the images of an SDT file: counts [Y, X] of each data block, which are channels or (--axes TYX) frames."""
+    """Read the images of an SDT file: counts [Y, X] of each data block, which are channels or (`axes` TYX) frames."""
     import sdtfile
 
     with decoding_errors(path, "SDT"), opening.opened(path) as opened, sdtfile.SdtFile(opened) as file:
@@ -61,7 +61,7 @@ def read_sdt(path: Path, hints: Hints) -> Recording:
 
 
 def _counts(path: Path, counts: Array, axes: str, source: str, hints: Hints) -> Recording:
-    """Return counts as codes of --bits, or of as many bits as the largest count needs."""
+    """Return counts as codes of `bits`, or of as many bits as the largest count needs."""
     largest = int(counts.max(initial=0))
     if largest > 65535:
         raise ValueError(f"{path}: {largest} counts in a pixel; codes have up to 16 bits, so read shorter frames")

@@ -33,7 +33,7 @@ from qsim.streams.stream import Stream
 
 Picture = NDArray[np.uint8]  # [H, W, 3]
 SAMPLES = 16  # frames on which the scales of a clip are measured
-KINDS = ("sharp", "radiance", "codes", "average", "flow", "depth")  # the values of --what
+KINDS = ("sharp", "radiance", "codes", "average", "flow", "depth")  # of views, by name
 CURVE = f"(value / brightest shown)^(1/{colour.GAMMA:g})"
 
 

@@ -69,7 +69,7 @@ class EventSensing:
     @property
     def camera_name(self) -> str:
         """The camera's name or file; empty for a record."""
-        return "" if isinstance(self.camera, EventCamera) else self.camera
+        return self.camera if isinstance(self.camera, str) else ""
 
     @property
     def stream_name(self) -> str:
@@ -78,7 +78,7 @@ class EventSensing:
             return check_name(self.name)
         light = light_name(self.ppp, self.lux)
         camera = Path(self.camera_name).name.removesuffix(".toml")
-        if isinstance(self.camera, EventCamera):
+        if not isinstance(self.camera, str):
             camera = f"events-{files.sha256(files.to_json(self.camera.to_dict()))[:8]}"
         return check_name(f"{camera}_{light}" + (f"_seed{self.seed}" if self.seed else ""))
 

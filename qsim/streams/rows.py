@@ -14,8 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy import ndarray as Array
@@ -40,10 +39,6 @@ class Rows:
     def __str__(self) -> str:
         """Return the readout in words: `each row 2e-06 s later, down`."""
         return f"each {self.line} {self.delay:g} s later, {self.order}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the record as a stream's description stores it."""
-        return asdict(self)
 
     @property
     def axis(self) -> int:
@@ -114,8 +109,3 @@ class Rows:
         y = part[0] - crop[0]
         x = part[1] - crop[1]
         return slice(y, y + part[2]), slice(x, x + part[3])
-
-
-def from_dict(value: dict[str, Any], where: str) -> Rows:
-    """Return the record that a stream's description holds; `ValueError` names `where` if it is damaged."""
-    return records.convert(value, Rows, where)

@@ -119,7 +119,7 @@ def sheet(
     """Draw one row per clip and one column per method as PNG, peak = white, gamma 2.2.
 
     `crops` names the crop of each clip and method; without a name its place stays empty. Return False, and leave
-    `target` as it is, if there are no crops, or named ones are missing: those of an earlier version had other names.
+    `target` as it is, if there are no crops, or named ones are missing.
     """
     rows = [clip for clip in clips if crop_file(out, light, clip, "truth").exists()][:SCENES_SHOWN]
     named = [crop_file(out, light, clip, name) for (clip, _), name in crops.items() if clip in rows]

@@ -313,7 +313,7 @@ def content_of(comparison: Comparison, clips: Sequence[Clip]) -> dict[str, objec
 def check_folder(out: Path, comparison: Comparison, *, force: bool = False) -> None:
     """Raise `FileExistsError` if OUT is neither an evaluation nor empty but for its lock and imported clips.
 
-    With `force` the error says that --force does not remove such a folder.
+    With `force` the error says that such a folder is not removed.
     """
     if (out / "plan.json").is_file() or not out.exists():
         return

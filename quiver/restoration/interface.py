@@ -143,7 +143,7 @@ def _run_unlike(method: Restorer) -> str | None:
 
 
 def measured_at(method: Restorer, codes: Codes) -> str | None:
-    """Return the measurement that is nearest to a stream, as a line for --verbose; None where there is none.
+    """Return the measurement that is nearest to a stream, as a line; None where there is none.
 
     Of a mosaic it is that of every colour.
     """

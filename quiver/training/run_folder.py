@@ -60,7 +60,7 @@ def _load_weights(model: nn.Module, stored: Any) -> None:
 
 
 def _alone(value: Any) -> Any:
-    """Return the value of a list of one: a protocol names one sensor, and --sensor a list."""
+    """Return the value of a list of one: a protocol names one sensor, and an option a list."""
     return value[0] if isinstance(value, list) and len(value) == 1 else value
 
 
