@@ -229,3 +229,49 @@ def test_the_manual_builds_strictly_and_loads_nothing_from_elsewhere(tmp_path):
     assert "paralyzable" in index
     assert 'id="qsim-sense"' in texts[site / "qsim.html"]
     assert 'id="qsim.sensor.QIS.white"' in texts[site / "api" / "qsim.sensor.html"]
+
+
+# Colours
+
+
+def colours(theme: str) -> dict[str, str]:
+    """The colours of a theme in the built manual: those of the package, then those of the project."""
+    import pydata_sphinx_theme
+
+    package = Path(pydata_sphinx_theme.__file__).parent / "theme/pydata_sphinx_theme/static/styles"
+    values: dict[str, str] = {}
+    for sheet in (package / "pydata-sphinx-theme.css", DOCS / "static" / "manual.css"):
+        rules = re.findall(r"([^{}]*)\{([^{}]*)\}", sheet.read_text(encoding="utf-8"))
+        for selector, body in rules:
+            if re.fullmatch(rf"\s*(?:/\*.*?\*/\s*)?(?:html|html\[data-theme=\"?{theme}\"?\])\s*", selector, re.DOTALL):
+                values |= dict(re.findall(r"--pst-([\w-]+):\s*([^;}]+)", body))
+    return values
+
+
+def luminance(colour: str) -> float:
+    digits = colour.strip().removeprefix("#")
+    digits = digits if len(digits) == 6 else "".join(2 * digit for digit in digits)
+    shares = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
+    red, green, blue = (x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in shares)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+def contrast(one: str, other: str) -> float:
+    """The ratio of WCAG 2: 4.5 is asked of text."""
+    dark, bright = sorted((luminance(one), luminance(other)))
+    return (bright + 0.05) / (dark + 0.05)
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("text", ["text-base", "text-muted", "heading", "inline-code", "link", "link-hover"])
+def test_text_has_contrast_on_each_ground_of_both_themes(theme, text):
+    pytest.importorskip("pydata_sphinx_theme")
+    values = colours(theme)
+
+    def colour(name: str) -> str:
+        value = values[f"color-{name}"].strip()
+        inner = re.fullmatch(r"var\(--pst-color-([\w-]+)\)", value)
+        return colour(inner[1]) if inner else value
+
+    for ground in ("background", "surface", "on-background"):
+        assert contrast(colour(text), colour(ground)) >= 4.5, ground
