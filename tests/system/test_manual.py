@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 sys.path.append(str(DOCS))
 
-from manual import api, comments_above, generated, mathml, menu, rooms  # noqa: E402
+from manual import api, comments_above, generated, mathml, menu, options_in_one_piece, rooms  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -229,6 +229,20 @@ def test_the_manual_builds_strictly_and_loads_nothing_from_elsewhere(tmp_path):
     assert "paralyzable" in index
     assert 'id="qsim-sense"' in texts[site / "qsim.html"]
     assert 'id="qsim.sensor.QIS.white"' in texts[site / "api" / "qsim.sensor.html"]
+
+
+def test_options_of_commands_are_kept_in_one_piece():
+    pytest.importorskip("pygments")
+    from pygments import highlight
+    from pygments.formatters import HtmlFormatter
+    from pygments.lexers import BashLexer
+
+    block = highlight(
+        "quiver train out/a-b -o out/c --preset mergenet\nmake --keep-going\n", BashLexer(), HtmlFormatter()
+    )
+    page = f'<p>--preset</p><div class="highlight-sh notranslate">{block}</div>'
+    marked = re.findall(r'<span class="option">(.*?)</span>', options_in_one_piece(page))
+    assert marked == ["-o", "--preset", "--keep-going"]
 
 
 # Colours
