@@ -147,6 +147,7 @@ def _replacing(*paths: Path) -> Iterator[Sequence[BinaryIO]]:
         parts = [scratch.new(number) for number in range(len(paths))]
         opened = [stack.enter_context(open(part, "x+b")) for part in parts]
         yield opened
+        # Contents reach the disk before their names do: after a power cut a name never stands for half a file.
         for file in opened:
             file.flush()
             os.fsync(file.fileno())
@@ -177,6 +178,7 @@ def replacing_together(*paths: Path) -> Iterator[tuple[Path, ...]]:
         yield parts
         made = [(part, path) for part, path in zip(parts, paths, strict=True) if part.is_file()]
         for part, _ in made:
+            # Synced by another descriptor than the one that wrote: fsync is about the file, not about who opened it.
             with open(part, "rb") as file:
                 os.fsync(file.fileno())
         scratch.name(*made)
@@ -309,6 +311,7 @@ def remove_folder(folder: Path) -> None:
             "or delete the link"
         )
     with Scratch(folder) as scratch:
+        # A deletion takes time and may be killed: under its old name half a folder would look whole.
         os.replace(folder, scratch.old)
         sync_folder(folder.parent)  # after a power cut no half of it has its name
         shutil.rmtree(scratch.old)
@@ -352,6 +355,7 @@ def load_array(path: Path, beside: Path | None = None) -> LazyArray:
         shape, fortran, dtype = read_npy_header(path, file)
         start = file.tell()
         size = os.fstat(file.fileno()).st_size
+        # A header may state any size: memory and reads are bounded by what the file has.
         wanted = math.prod(shape) * dtype.itemsize
         if start + wanted > size:
             raise ValueError(f"{path}: the header states {wanted} bytes, the file has {size - start}")

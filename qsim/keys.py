@@ -144,6 +144,7 @@ def uniform(first: Array, second: Array | None = None) -> Array:
 
     Two words just below 1 round to 1 in float64; `uniform_pair` keeps the precision of both tails.
     """
+    # Centres of cells: neither 0 nor 1 occurs, at which inverse laws are infinite.
     low = 0.5 if second is None else (second.astype(np.float64) + 0.5) * 2.0**-32
     return (first.astype(np.float64) + low) * 2.0**-32
 

@@ -111,6 +111,7 @@ def _electrons(electrons: Array, noise: float, mean: Array, spread: Array) -> tu
     # three points at a fixed distance have any small variance, also a negative one
     step = np.minimum(np.sqrt(3 * np.maximum(spread, 0.1 * variance)), 0.9 * mean)
     step = np.maximum(step, 1e-9)
+    # Weights of three points -d, 0, d with a variance of `spread`: share / 2 at each end.
     share = spread / step**2
     nodes = np.zeros((len(NODES), len(mean)))
     weight = np.zeros_like(nodes)
@@ -129,6 +130,7 @@ def _electrons(electrons: Array, noise: float, mean: Array, spread: Array) -> tu
     by_mean = np.einsum("kr,krn->rn", weight[:used], slope)
     by_share = (mass[0] + mass[2] - 2 * mass[1]) / (2 * step**2)[:, None]
     if wide.any():
+        # A node moves with the root of the spread: d(node) / d(spread) = NODES / (2 deviation).
         turn = NODES[:, None] / np.maximum(2 * deviation, 1e-12) * WEIGHTS[:, None]
         by_share[wide] = np.einsum("kr,krn->rn", turn[:, wide], slope[:, wide])
     return total, by_mean, by_share
@@ -144,6 +146,7 @@ def _edgeworth(at: Array, noise: float, mean: Array, spread: Array) -> Array:
         skew = mean / deviation**3
         kurtosis = mean / deviation**4
         y = (at - (mean + shift)[:, None]) / deviation[:, None]
+        # Edgeworth's series in Hermite polynomials, to the second power of the skewness.
         series = skew[:, None] / 6 * (y**2 - 1) + kurtosis[:, None] / 24 * (y**3 - 3 * y)
         series += skew[:, None] ** 2 / 72 * (y**5 - 10 * y**3 + 15 * y)
         return ndtr(y) - np.exp(-0.5 * y * y) / sqrt(2 * pi) * series
@@ -151,6 +154,7 @@ def _edgeworth(at: Array, noise: float, mean: Array, spread: Array) -> Array:
     variance = mean + noise**2 + spread
     by_shift = 1e-4 * np.sqrt(variance)
     by_variance = 1e-4 * variance
+    # Derivatives by central differences, exact to 1e-8 relative: enough for scores, whose zero decides.
     slope = (cdf(by_shift, variance) - cdf(-by_shift, variance)) / (2 * by_shift[:, None])
     wider = (cdf(0.0, variance + by_variance) - cdf(0.0, variance - by_variance)) / (2 * by_variance[:, None])
     return np.stack([cdf(0.0, variance), -slope, 2 * noise * wider, slope + wider, wider])

@@ -51,6 +51,7 @@ class Correlations:
                 found[name] = normal_interval(chance.value, chance.variance, unit, method, floor=0.0)
         if "crosstalk" in found:
             one = found["crosstalk"]
+            # The chance that any of the four neighbours fires, independently of each other.
             value, low, high = (1 - (1 - c) ** NEIGHBOURS for c in (one.value, one.low, one.high))
             found["crosstalk_total"] = Value(value, low, high, "to any of four neighbours", "as data sheets state it")
         return found
@@ -105,7 +106,9 @@ def _afterpulsing(stack: FrameStatistics, bits: int, value: float) -> _Pairs | N
     if t < 3 or not np.isfinite(stack.lagged).all() or not variance.any():
         return None
     mean = stack.total / t
+    # Sum of (x_t - m)(x_(t+1) - m) from running sums: frames need not be kept.
     products = stack.lagged - mean * (2 * stack.total - stack.first - stack.last) + (t - 1) * mean**2
+    # The fitted mean is common to both factors and takes 1 / T of the variance off: it is added again.
     covariance = float((products / (t - 1) + variance / t).sum())
     kept = (t - 2) ** 2 * (t + 1) / (t**2 * (t - 1))
     room = _room(stack, bits, value)
@@ -117,6 +120,8 @@ def _afterpulsing(stack: FrameStatistics, bits: int, value: float) -> _Pairs | N
 def _mean_square(variance: Array, frames: int) -> float:
     """Return the mean square of the pixels' variances, without the noise of the estimates."""
     mean = float(variance.mean())
+    # The estimate s^2 scatters by itself by 2 s^4 / (T - 1) and the fourth
+    # cumulant over T, which for Poisson counts is the mean.
     square = (float((variance**2).mean()) - mean / frames) * (frames - 1) / (frames + 1)
     return max(square, mean**2)
 

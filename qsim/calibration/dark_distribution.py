@@ -94,6 +94,7 @@ def _order_statistic(ordered: Array, percent: float, counts: Counts) -> tuple[fl
     n = ordered.size
     share = percent / 100
     value = float(np.percentile(ordered, percent))
+    # The rank of a percentile is binomial, whatever the law: an interval without any assumption.
     first = binomial_quantile(0.025, n, share) - 1
     last = binomial_quantile(0.975, n, share)
     low = float(ordered[first]) if first >= 0 else 0.0
@@ -128,6 +129,7 @@ def _spread(ordered: Array, counts: Counts) -> float:
     """Return the variance of the logarithm of the rate between the quartiles, without noise; 0 if noise explains it."""
     typical = max(float(np.median(ordered)), 1.0)
     quarter = float(np.percentile(ordered, 75)) / max(float(np.percentile(ordered, 25)), 1.0)
+    # Quartiles of a normal law are 1.349 deviations apart; the noise of the logarithm of a count is 1 / count.
     return max((log(max(quarter, 1.0)) / 1.349) ** 2 - counts.spread / typical, 0.0)
 
 
@@ -222,6 +224,7 @@ class _Pixels:
 
         bulk = self.table @ _weights(self.grid, m, s, k)
         likelihood, share = _with_hot(bulk, self.hot, self.times, self.beyond)
+        # The median of all pixels lies higher in the law of the bulk, as hot pixels fill the upper end.
         z = ndtri(np.minimum(0.5 / (1 - share), 0.999))
         return _Laws(m, s, k, likelihood, quantile(m, s, k, z))
 

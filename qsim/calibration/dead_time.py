@@ -146,7 +146,9 @@ def fano_residuals(flats: Sequence[Pooled], response: Response) -> Array:
     third = (pmf * centred**3).sum(axis=1)
     fourth = (pmf * centred**4).sum(axis=1)
     v = np.maximum(matched.variance, 1e-12)
+    # The variance of (s^2 - v(mean)): Var s^2 = (mu4 - v^2) / n, Var of the mean = v / n, and their covariance mu3 / n.
     noise = fourth - v**2 + matched.slope**2 * v - 2 * matched.slope * third
+    # Jensen: E v(m) = v(E m) + v'' Var m / 2 over pixels of different means.
     expected = matched.variance + matched.bend / 2 * np.minimum(pattern, (mean / 2) ** 2)
     # Afterpulses vary the mean over the frames, which the variance about it leaves out.
     expected = expected * (1 - (response.excess(mean) - 1) / np.maximum(frames - 1, 1))
@@ -168,6 +170,7 @@ def matched_variance(mean: Array, response: Response) -> Matched:
 
     Newton's method on the rising branch. If no light gives this mean, the variance is 0, which no data match.
     """
+    # The inverse of the mean count without fluctuations: m / (1 - m tau / T).
     start = mean if response.paralyzable else mean / np.maximum(1 - mean * response.ratio, 0.2)
     arrivals = np.array(start, float)
     steep = np.ones(arrivals.shape, bool)

@@ -47,6 +47,8 @@ def profile(fit: Fit, direction: Array, step: float, farthest: float, *, bound: 
     error = min(error, step)
     search = _Search(fit, direction, scale, value, error, farthest)
     at_bound = value - bound < 1e-9 * max(abs(value), 1.0) if isfinite(bound) else False
+    # At a bound half of the normal law is cut off, so that the other end is a
+    # one-sided quantile; between, the quantile rises evenly.
     if at_bound:
         high, _ = search.end(1, ONE_SIDED + RISE * 0.9, inf)
         return Interval(value, bound, high, False)
@@ -59,6 +61,7 @@ def profile(fit: Fit, direction: Array, step: float, farthest: float, *, bound: 
         target = min(Z95, (ONE_SIDED + RISE * root) / (1 + RISE))
     low, first = search.end(-1, target, bound)
     high, second = search.end(1, Z95, inf)
+    # A second maximum outside of the interval that is nearly as likely belongs to it.
     for mode in fit.modes:
         at = float(direction @ mode.parameters)
         root = search.root_of(mode)
@@ -88,6 +91,8 @@ class _Search:
         self.error = error
         self.farthest = farthest
         along = fit.inverse @ direction
+        # Where the direction is held, the others follow along inverse
+        # information times direction: the ridge of the likelihood.
         size = float(direction @ along)
         self.along = along / size if size > 0 else direction / float(direction @ direction)
         self.last: State = fit.state
@@ -102,6 +107,8 @@ class _Search:
         """Return the root of a state; `HigherMaximum` if its likelihood exceeds that of the fit."""
         if state.value > self.fit.state.value + HIGHER:
             raise HigherMaximum(state)
+        # The signed root: standard errors of a normal law, over the
+        # scatter between pixels that the model does not know.
         return sqrt(max(2 * (self.fit.state.value - state.value), 0.0) / self.scale)
 
     def _starts(self, at: float) -> list[Array]:

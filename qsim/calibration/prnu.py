@@ -184,6 +184,7 @@ def _of_good(flat: Flat, good: Array) -> tuple[Value, float]:
     for _ in range(4):
         root = np.sqrt(weights)
         orthonormal, _ = np.linalg.qr(basis * root[:, None])
+        # A fitted surface follows its pixels a little: residuals are (1 - leverage) of the variance too small.
         leverage = np.minimum((orthonormal**2).sum(axis=1), 0.99)
         fitted = (orthonormal @ (orthonormal.T @ (root * level))) / root
         squares = (level - fitted) ** 2 / (1 - leverage)
@@ -191,6 +192,7 @@ def _of_good(flat: Flat, good: Array) -> tuple[Value, float]:
         even = float(noise.mean()) * share / float(share.mean())  # smooth, because each pixel's estimate would bias
         shape = np.maximum(model.variance(fitted, max(s, 0.01)), 1e-30)
         total = shape + even
+        # Weights of a maximum of the normal likelihood in s: what PRNU adds to the variance, over the variance squared.
         gain = shape / total**2
         observed = float(gain @ squares)
         explained = float(gain @ noise)
@@ -198,6 +200,7 @@ def _of_good(flat: Flat, good: Array) -> tuple[Value, float]:
         weights = 1 / (np.maximum(model.variance(fitted, max(s, 0.01)), 1e-30) + even)
         weights /= weights.mean()
     n, terms = basis.shape
+    # Variances of variances need the fourth moment; of a normal sample it scatters by root(24 / n).
     kurtosis = float(np.mean((squares / total) ** 2) / np.mean(squares / total) ** 2) - 3
     excess = kurtosis if kurtosis > 2 * sqrt(24 / n) else 0.0
     of_observed = (2 + excess) * float(gain**2 @ total**2) * (observed / float(gain @ total)) ** 2 * n / (n - terms)
@@ -216,6 +219,7 @@ def difference_interval(first: float, of_first: float, second: float, of_second:
         """Return how far the true value may lie below and above by chi-square, relative."""
         if variance <= 0 or value <= 0:
             return 0.0, 0.0
+        # Satterthwaite's degrees of freedom: those of a chi-square of the same mean and variance.
         freedom = max(2 * value**2 / variance, 1.0)
         return 1 - freedom / chi2_quantile(0.975, freedom), freedom / chi2_quantile(0.025, freedom) - 1
 
@@ -236,6 +240,7 @@ class _Model:
 
     def variance(self, expected: Array, s: float) -> Array:
         """Return the variance between pixels [N], codes^2, at expected codes [N] for a PRNU `s`."""
+        # A pixel of relative sensitivity 1 + s z at each light: nine of them stand for the normal law of z.
         light = self.grid[:, None] * np.maximum(1 + s * NODES, 0)
         codes = np.interp(light, self.light, self.codes)
         mean = codes @ WEIGHTS

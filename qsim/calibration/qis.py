@@ -50,6 +50,7 @@ def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatist
     good = good_pixels(darks, flats)
     cells = cells_of(darks, flats, good)
     fit = fit_cells(cells, exposures, len(darks), bits)
+    # Warm pixels show only against the fitted law; without them the law is fitted once more.
     used = without_warm(fit, darks, good)
     if not np.array_equal(used, good):
         cells = cells_of(darks, flats, used)
@@ -166,6 +167,8 @@ def _without_dark_current(fit: Fit, values: dict[str, Value]) -> dict[str, Value
     One dark exposure tells dark current by the skewness of its histogram. Hot pixels that noise hides are skew, too.
     """
     start = fit.state.parameters.copy()
+    # Without dark current the same histograms need a higher offset and
+    # more read noise: its mean and its variance, in electrons.
     start[OFFSET] += fit.gain * start[DARK] * float(fit.likelihood.share.max())
     start[NOISE] = 0.5 * log(fit.noise**2 + start[DARK])
     start[DARK] = 0.0
@@ -203,6 +206,7 @@ def _efficiency(fit: Fit, flats: Sequence[FrameStatistics], exposures: Sequence[
             k = likelihood.own[c]
             share = cell.pixels.size / pixels / photons
             directions[row, k] = share
+            # How far pixels scatter beyond the model: the sandwich over the inverse information.
             excess = covariance[k, k] / max(fit.inverse[k, k], 1e-300)
             own[row] += share**2 * excess / max(fit.state.information[k, k], 1e-300)
         directions[row, DARK] = -exposures[darks + i] / max(exposures[:darks]) / photons
@@ -225,6 +229,8 @@ def _efficiency(fit: Fit, flats: Sequence[FrameStatistics], exposures: Sequence[
         freedom = len(own) - 1
         inner = float(weights**2 @ own)
         scatter = float(weights @ (found - value) ** 2) / freedom
+        # The interval of the profile holds the flats' own noise by a normal
+        # law; what their scatter adds to it is by Student's t.
         reach = student_quantile(0.975, freedom) ** 2 * scatter - Z95**2 * inner
         low = value - sqrt(max((value - low) ** 2 + reach, 0.0))
         high = value + sqrt(max((high - value) ** 2 + reach, 0.0))
@@ -250,6 +256,8 @@ def _without_drift(flat: FrameStatistics, cells: Sequence[Cell], stack: int) -> 
     for cell in members:
         drift += cell.pixels.size * (float(cell.codes.var(axis=0, ddof=1).mean()) - cell.variance)
         light += cell.pixels.size * (cell.mean - base) ** 2
+    # Drift of the lamp moves all pixels together: the variance of a
+    # cell's mean over time, in units of its light squared.
     relative = max(drift / light, 0.0) if light > 0 else 0.0
     level = flat.total / flat.frames - base
     return replace(flat, square=flat.square - (flat.frames - 1) * relative * level**2)
@@ -275,6 +283,7 @@ def _goodness(fit: Fit, stacks: int, bits: int) -> tuple[float, tuple[Array, ...
             histograms.append((panel.counts[r], fitted))
             np.add.at(observed[fit.likelihood.cells[i].stack], codes, panel.counts[r])
             np.add.at(expected[fit.likelihood.cells[i].stack], codes, fitted)
+    # Pearson's residuals: counts are Poisson, with the root of the expected count as deviation.
     residuals = (observed - expected) / np.sqrt(np.maximum(expected, 1.0))
     simple = fit.likelihood.simple
     own = int(np.count_nonzero(~fit.likelihood.dark[simple]))  # parameters that the mean of a cell determines

@@ -81,6 +81,8 @@ class Response:
             return 1 - dark
         code = 1 - dark
         for _ in range(_ITERATIONS):
+            # A plane stays dark without arrival, without afterpulse of the
+            # plane before, and without crosstalk of four neighbours.
             without = dark * (1 - self.afterpulsing * code)
             code = 1 - without * (1 - self.crosstalk * (1 - without)) ** NEIGHBOURS
         return code
@@ -141,6 +143,7 @@ class Response:
         t = stack.frames
         zeros = t - stack.total
         mean = stack.total / t
+        # Sums of 1/j and of 1/j^2 by digamma and trigamma: the expectation of -ln(share of zeros), and its variance.
         found = digamma(t + 1) - digamma(zeros + 1)
         variance = polygamma(1, zeros + 1) - polygamma(1, t + 1)
         found = found + np.log1p(-self.afterpulsing * mean)
@@ -173,6 +176,8 @@ class Response:
         variance = variance * self.excess(mean) / t
         slopes = np.maximum(np.interp(found, arrivals, slope_table), _LEAST_ROOM)
         curvature = np.interp(found, arrivals, np.gradient(slope_table, arrivals))
+        # f'' of the inverse is -curvature / slope^3: its half times the
+        # variance is what a curved inverse adds to the mean.
         found = found + 0.5 * curvature / slopes**3 * variance
         return Arrivals(found, variance / slopes**2, float(np.interp(at, arrivals, slope_table)))
 
@@ -187,6 +192,8 @@ class Response:
         """Return the mean number of afterpulses and crosstalk counts in a frame: [p] -> [p]."""
         counted = arrivals if self.ratio == 0 else _mean_count(self._unclipped, arrivals)
         spread = 1 + NEIGHBOURS * self.crosstalk
+        # Each avalanche has `spread` descendants by crosstalk, and each of
+        # these an afterpulse with its own: a geometric series.
         return np.asarray(counted * (spread / (1 - self.afterpulsing * spread) - 1))
 
 
@@ -212,6 +219,7 @@ def _with_poisson(pmf: Array, mean: Array) -> Array:
     levels = pmf.shape[1]
     k = np.arange(levels)
     extra = np.exp(xlogy(k, mean[:, None]) - mean[:, None] - gammaln(k + 1))
+    # Twice the length, so that the convolution does not wrap around.
     size = 2 * levels
     product = np.fft.irfft(np.fft.rfft(pmf, size) * np.fft.rfft(extra, size), size)[:, :levels]
     product = np.maximum(product, 0.0)

@@ -95,6 +95,7 @@ def clamped_squares(squares: Array, picture: Array, lower: Array, white: float) 
     pixel may be white because of a single bright path: its error is then the distance of its darker half to white. The
     light of such pixels above white is missing in all others, and each of them errs by its share of it.
     """
+    # Light that a few bright paths bring to some pixels is missing in all others, on average: a bias of all.
     stray = float(np.mean(np.where(lower < white, np.maximum(picture - white, 0), 0)))
     return np.where(picture < white, squares, (white - np.minimum(lower, white)) ** 2) + stray**2
 
@@ -122,6 +123,7 @@ def over_neighbours(errors: Sequence[float], means: Sequence[float], shares: boo
     count = np.ones_like(squares)
     sums = squares.copy()
     for here, there in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+        # A relative difference: frames of other light have other errors.
         near = np.abs(lights[here] - lights[there]) <= NEAR * lights[here]
         if shares:
             near[:1] = near[-1:] = False

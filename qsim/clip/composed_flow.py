@@ -58,6 +58,7 @@ def composed(clip: Moving, first: int, last: int) -> tuple[Array, Array]:
     moved = step
     for t in range(first + 1, last):
         found, known, depth = _between(clip, t, start + moved, body, depth)
+        # Where the point is lost it goes on as it moved: a flow without holes, of which `valid` tells what to trust.
         step = np.where(known, found, step)
         valid &= known
         moved = moved + step
@@ -92,6 +93,7 @@ def _between(
             if body is not None and bodies is not None:
                 usable &= bodies[at] == body
             if depth is not None and depths is not None:
+                # A body that hides a part of itself, as an arm before a trunk: its other side moves otherwise.
                 usable &= np.abs(depths[at] - depth) <= APART * depth
                 deep += np.where(usable, weight * depths[at], 0.0)
             weight = np.where(usable, weight, 0.0)

@@ -141,6 +141,7 @@ class ClipWriter:
             raise ValueError(f"{self.path}: frame {t} does not belong to a clip of {self.info.shape[0]} frames")
         radiance = plain(radiance)
         contents: dict[str, bytes] = {}
+        # Everything that is stated of a frame is that of its stored halves: a reader finds the same numbers.
         half = self._encode(t, "radiance", radiance, contents)
         lower = exr.above_half(radiance) if saturated is None else saturated | exr.above_half(radiance)
         if sharp is not None:
@@ -154,6 +155,7 @@ class ClipWriter:
         else:
             (self.part / mask).unlink(missing_ok=True)  # of an earlier writer
         earlier = self._frames.get(t)
+        # A renderer that resumes may render a frame once more; equal bytes are not written again.
         if earlier and earlier.checksums == {name: files.sha256(content) for name, content in contents.items()}:
             return
         checksums = {}
@@ -290,6 +292,7 @@ class ClipWriter:
                 "and run the same command again"
             )
         check_replaced(self.path)
+        # What only the writer needs goes before the rename: the clip's name stands for a clip and nothing else.
         for name in ("begun.json", "journal.jsonl", "lock"):
             (self.part / name).unlink(missing_ok=True)
         files.sync_folder(self.part)  # after a power cut the clip holds none of them
@@ -336,6 +339,7 @@ class ClipWriter:
     def _high(self) -> float:
         """Return the 99.9th percentile of the radiance, over at most 4 million evenly spaced samples."""
         frames, height, width = self.info.shape
+        # The same step along both axes, so that samples are even in space.
         step = max(1, math.isqrt(frames * height * width // 4_000_000))
         colour = self.info.bands is not None
         paths = [self.part / frame_file("radiance", t) for t in range(frames)]

@@ -156,6 +156,7 @@ class _Todo:
             self.failed[job.name] = result.message
         elif not there:
             self.failed[job.name] = _ELSEWHERE
+        # A worker may be killed between its files and its word, or report what it never wrote: files decide.
         elif problem := unproven(self.folder, job):
             record_path(self.folder, job.key).unlink()
             self.failed[job.name] = f"{_REPORTED}{problem}"
@@ -237,6 +238,7 @@ def _begin(recipe: Recipe, folder: Path, jobs: Jobs, repair: bool) -> tuple[str,
     for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
         sweep(folder / name)
+    # The manifest is written last of all that begins a data set; without it, records decide whose folder this is.
     if not (folder / "dataset.json").is_file():
         _check_records(recipe, folder, repair)
         _check_reads(folder, jobs)
@@ -345,6 +347,7 @@ def _locked(folder: Path, options: Options) -> Iterator[None]:
     (folder / "locks").mkdir(parents=True, exist_ok=True)
     sweep(folder)
     sweep(folder / "locks")
+    # Shards share one lock, which a generator of the whole takes alone.
     held = [Lock(folder / "locks" / "generate", shared=options.shard is not None)]
     if options.shard is not None:
         held.append(Lock(folder / "locks" / "shard-{}-of-{}".format(*options.shard)))

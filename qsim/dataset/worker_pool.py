@@ -48,6 +48,7 @@ def run_local(jobs: Iterable[Job], folder: Path, make: RenderJob, workers: int, 
     pool: list[_Worker] = []
     try:
         while queue or any(worker.job for worker in pool):
+            # A process is started only when there is a job for it: each one loads the renderer.
             while queue and len([w for w in pool if w.job]) < workers:
                 worker = next((w for w in pool if w.job is None), None)
                 if worker is None:
@@ -67,6 +68,7 @@ def run_local(jobs: Iterable[Job], folder: Path, make: RenderJob, workers: int, 
                         job.name, "crashed", f"its worker process crashed {MAX_CRASHES} times ({worker.exit_reason})"
                     )
                     mark_failed(folder, job, result.message)
+                # The memory of a renderer grows from job to job; a new process begins anew.
                 elif worker.jobs >= limits.jobs:
                     pool.remove(worker)
                     worker.close()

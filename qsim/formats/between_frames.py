@@ -73,6 +73,7 @@ class Between:
         first = (1 - share) * (1 - differ * seen[0] * (1 - seen[1]))  # less where frame 1 alone sees the point
         second = share * (1 - differ * seen[1] * (1 - seen[0]))
         total = first + second
+        # Seen by neither frame, it is mixed by time alone.
         first = np.where(total > _SHARE, first / np.maximum(total, _SHARE), np.float32(1 - share))
         weights = [first, 1 - first]
         light = [self._drawn(image, *end) for image, end in zip(self._light, ends, strict=True)]
@@ -84,6 +85,7 @@ class Between:
 
     def _motion(self, share: float) -> tuple[Array, Array]:
         """Return the motion from 0 to 1 of what is at each pixel at a share of the way, and how unlike its ends are."""
+        # Where motions cross, no single flow fits: forward, backward and their mean are tried at each pixel.
         candidates = (
             self._carried(self._forward, share),
             -self._carried(self._back, 1 - share),
@@ -116,6 +118,7 @@ class Between:
         x, y = self._place(there, 1.0)
         height, width = x.shape
         returned = self._drawn(back, x, y)
+        # A point that both frames show comes back to where it began (Sundaram, Brox and Keutzer, 2010).
         apart = ((there + returned) ** 2).sum(axis=-1)
         size = (there**2).sum(axis=-1) + (returned**2).sum(axis=-1)
         inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)

@@ -115,6 +115,7 @@ class CameraRays:
             lens = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * pupil
             shift = axes[0] * lens.x + axes[1] * lens.y
             origin = origin + shift
+            # All rays of a thin lens through a point of the plane in focus meet there, wherever they pass the pupil.
             direction = direction * focus - shift
         return mi.RayDifferential3f(o=mi.Point3f(origin), d=dr.normalize(direction))
 
@@ -146,6 +147,7 @@ class _Bends:
         # The stretch s of the slope seen: s (1 + k1 (s seen)^2 + k2 (s seen)^4 + ...) = 1
         off = stretch * (1 + square * _sum_of_powers(self._terms, square)) - 1
         rise = [(2 * i + 3) * term for i, term in enumerate(self._terms)]
+        # Newton's step in s: the derivative of s (1 + k1 s^2 seen^2 + ...) is 1 + 3 k1 ... + 5 k2 ...
         stretch -= off / (1 + square * _sum_of_powers(rise, square))
         return across * stretch, down * stretch
 

@@ -130,6 +130,8 @@ def mixture(halves: Array, cleaned: Array) -> Mixture:
 
     z = halves[0] - halves[1]
     y = cleaned[0] - cleaned[1]
+    # Half differences are noise: z / 2 of the raw mean, (z - y) / 2 of raw less denoised. Their product estimates
+    # the covariance of both, and that over the squared difference is the share with the least error.
     gain = z * (z - y) / 4
     apart = (cleaned.mean(axis=0) - halves.mean(axis=0)) ** 2
     share = np.clip(
@@ -138,6 +140,7 @@ def mixture(halves: Array, cleaned: Array) -> Mixture:
         1,
     )
     mixed = share * cleaned + (1 - share) * halves
+    # The error of M + w (C - M): that of M, less twice w times the covariance, plus w^2 times the difference squared.
     squares = z**2 / 4 - 2 * share * gain + share**2 * apart
     return Mixture(share, mixed.mean(axis=0), mixed.min(axis=0), squares, z**2 / 4)
 

@@ -80,6 +80,8 @@ class Stage:
                 self._place_part(part.name, part.pose(t), self._rest[part.name])
         with errors_only(self.mi):  # the scalar engine warns of normals that it cannot compute; ours replace them
             self._parameters.update()
+        # Mitsuba computes normals anew when vertices change, and would
+        # smooth over creases: ours are set after its update.
         if self._normals:
             for key, normals in self._normals.items():
                 self._parameters[key] = normals.ravel()
@@ -168,6 +170,7 @@ class Stage:
             self._normals[f"{name}.{NORMALS}"] = (rest[1] @ pose[:3, :3].T).astype(np.float32)
 
     def _set(self, key: str, value: Array, make: Any) -> bool:
+        # Setting a parameter makes Mitsuba rebuild what depends on it, also if its value is the same.
         stamp = value.tobytes()
         if self._placed.get(key) == stamp:
             return False
@@ -266,6 +269,7 @@ def _scene_dict(mi: Any, scene: Scene, smooth_weight: float) -> dict[str, Any]:
         parts |= _light(mi, scene, light, f"light{i}", smooth_weight)
     for i, body in enumerate(scene.bodies):
         name = f"body{i}"
+        # An instance moves by one matrix; a mesh of its own has each vertex rewritten and its tree rebuilt.
         if _is_instance(body):
             group: dict[str, Any] = {"type": "shapegroup"}
             for k, (_, material, faces) in enumerate(_shapes(i, body)):
@@ -306,6 +310,7 @@ def _mesh(
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": _value(mi, material.radiance)})
         properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _value(mi, 0.0)})
     else:
+        # Materials of files bring large textures; shapes of one material share what was loaded.
         shared = surfaces.get(id(material))
         properties["bsdf"] = mi.load_dict(_bsdf(mi, material)) if shared is None else shared
     colours = None
@@ -380,6 +385,7 @@ def _sun(mi: Any, scene: Scene, light: lights.SunSky) -> dict[str, Any]:
     centre = np.asarray(scene.camera.origin)
     points = [_to_world(body.pose(0.0), body.vertices(0.0)) for body in scene.bodies] or [centre[None]]
     reach = max(1.0, *(float(np.max(np.linalg.norm(p - centre, axis=1))) for p in points))
+    # Far enough that its rays are parallel within the scene; its size keeps the angular radius.
     distance = SUN_DISTANCE * reach
     towards = sun_direction(light)
     origin = (centre + distance * towards).tolist()

@@ -63,6 +63,8 @@ class Pilot:
         times = set(counts)
         known = set(np.unique([renderer.motion_extent(t)[1] for t in times]).tolist())
         for _ in range(MOST_MORE):
+            # A body that enters the picture late would be rendered in no
+            # frame of the pilot, and its light known to none.
             hidden = ~np.isin(bodies, list(known))
             if not hidden.any():
                 break
@@ -108,6 +110,7 @@ class Pilot:
             means = [self.blurred(t, count * times, bounces) for times in (1, 3, 5)]
             both = (np.minimum(means, white), means)
             squares.append([[np.mean(np.prod(few - many, axis=0)) for many in more] for few, *more in both])
+        # Products of independent halves may be negative by chance; their mean has no bias.
         largest = self.counted(np.array(squares)).mean(axis=0).max(axis=1)
         return Errors(*np.sqrt(np.maximum(largest, 0)).tolist())
 
@@ -154,6 +157,7 @@ def _lit(renderer: Renderer, frames: int) -> tuple[int, dict[int, int]]:
     bright = strengths >= strengths.max() / 2
     if bright[times].any():
         return brightest, dict.fromkeys(times, 1)
+    # Rare flashes: the few bright frames decide white, and the dark ones how much light the clip has.
     flashes = int(np.count_nonzero(bright))  # less than a twelfth of the frames
     often = min(round((frames - flashes) / flashes / STRENGTHS), MOST_COUNTED)
     return brightest, dict.fromkeys(times, often) | {brightest: 1}
@@ -233,6 +237,7 @@ def denoised_samples(
     parts = [renderer.window(crop) for crop in windows(camera)]
     times = pilot.exposed(t, count)
     key = renderer.key(t, STAGE)
+    # Albedo and normals do not depend on the samples that are tried: they are drawn once.
     surfaces = [window.surfaces(times, key) for window in parts]
 
     def trial(samples: int) -> dict[str, float]:
@@ -252,6 +257,7 @@ def denoised_samples(
     trials: list[dict[str, float]] = []
     for samples in tried:
         trials.append(trial(samples))
+        # The error falls with the samples; more trials than the first that suffices only cost time.
         if trials[-1]["high"] <= share:
             break
     faster = min(trials[0].get(quality, math.inf) for quality in ("balanced", "fast"))

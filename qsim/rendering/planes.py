@@ -69,6 +69,8 @@ def together(halves: Array, surfaces: tuple[Array, Array] | None, budget: Budget
     light = np.empty(halves.shape[:1] + halves.shape[2:], np.float32)
     errors = []
     for plane, own in enumerate(halves.astype(np.float64)):
+        # Each plane is multiplied by what denoising made of the mean: what all
+        # planes share becomes clean, what is a plane's own stays.
         carried = np.where(mean > 0, own * (wanted / np.where(mean > 0, mean, 1)), wanted)
         light[plane] = carried.mean(axis=0)
         errors.append(_stated(_against(own, carried), budget, white))
@@ -97,6 +99,8 @@ def _against(own: Array, halves: Array) -> _Measured:
     """Return the error of the mean of two halves [2, ...] of which each has noise of the same one of `own` only."""
     z = own[0] - own[1]
     picture = halves.mean(axis=0)
+    # The error without the truth, from two halves: their difference z is noise alone, and its product with
+    # the picture's own difference is the part of the noise that the picture kept.
     squares = (picture - own.mean(axis=0)) ** 2 + (halves[0] - halves[1]) * z / 2 - z**2 / 4
     noise = (halves[0] - halves[1]) ** 2 / 4
     return _of_mixture(Mixture(np.ones_like(z), picture, halves.min(axis=0), squares, z**2 / 4, noise))

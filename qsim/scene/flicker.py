@@ -38,6 +38,7 @@ class Mains:
 
     def mean(self, start: Array, stop: Array) -> Array:
         """Return the mean strength over the times from `start` to `stop` [s], float64 of their shape."""
+        # The mean of a cosine over an interval is that at its middle times sinc of its length.
         middle = np.mod(self.frequency * (np.asarray(start) + stop) / 2, 1.0) + self.phase / math.tau
         return 1 + self.depth * np.cos(math.tau * middle) * np.sinc(self.frequency * np.subtract(stop, start))
 
@@ -60,6 +61,7 @@ class RectifiedSine:
         # 1/2 - cos(pi u) / 2 is the integral of pi / 2 sin(pi u) from 0 to u < 1. A sum of cosines is written as a
         # product: short exposures would cancel.
         inside = np.sin(math.pi * (first + last) / 2) * np.sin(math.pi * turns / 2)
+        # From the start to the end of its period, then whole periods of mean 1, then the rest.
         across = whole + (np.cos(math.pi * first) - np.cos(math.pi * (last - whole))) / 2
         return np.where(whole == 0, inside, across) / turns
 

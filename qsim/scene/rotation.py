@@ -66,6 +66,7 @@ def rotation_between(start: ArrayLike, end: ArrayLike) -> Array:
     if np.linalg.norm(axis) < 1e-12:
         if cosine > 0:
             return np.eye(3)
+        # Opposite directions: any axis across will do, and the one farthest from `a` is the surest.
         axis = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
     return rotation_matrix(axis, float(np.arccos(cosine)))
 

@@ -109,6 +109,7 @@ def unpack(packed: Array, bits: int, width: int) -> Array:
     mask = dtype.type(2**bits - 1)
     for i in range(8):
         value = np.zeros(columns.shape[:-1], dtype)
+        # A code of up to 16 bits lies in at most three bytes; each gives its part, shifted to its place.
         for byte in range(i * bits // 8, ((i + 1) * bits - 1) // 8 + 1):
             shift = (i + 1) * bits - 8 * (byte + 1)
             column = columns[..., byte].astype(dtype)

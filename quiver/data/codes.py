@@ -262,6 +262,7 @@ def light_of(codes: Codes) -> float:
         rise = START * (table.mean[-1] - table.mean[0])
         slope = np.interp(table.mean[0] + rise, table.mean, table.photons) / rise
         pooled, pixels = _pooled(mean)
+        # Below the code of a dark pixel light goes on as a straight line, to negative values: their mean is right.
         light = table.invert(pooled, len(taken) * int(pixels.max())) + slope * np.minimum(pooled - table.mean[0], 0)
         found = float(np.average(light, weights=pixels))
     except ValueError:
@@ -405,6 +406,7 @@ def repaired(codes: Codes, found: defects.Defects | None) -> Codes:
     """Return the codes of a sensor with these defects: dead and hot pixels filled, the dark rate that of the others."""
     left = _not_inverted(vars(found) if found else {})
     shape = codes.shape[1:]
+    # Twice: the light, which decides who is hot beside it, is estimated with the dark rate of the sensor's own law.
     codes = replace(codes, sensor=defects.behind(None, found, codes.sensor, shape), not_inverted=left)
     bad = defects.defective(found, codes.sensor, codes.exposure, light_of(codes), shape)
     return filled(replace(codes, sensor=defects.behind(bad, found, codes.sensor, shape)), bad)

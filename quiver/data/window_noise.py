@@ -128,11 +128,13 @@ class WindowLight:
         array = PixelArray(draw.plane)
         if noise.defects is not None:
             array = _pixel_array(noise.defects, draw.plane, clip.shape[1:], draw.origin)
+        # A window that runs backwards is exposed in that order: what came before it lies behind its end.
         before = len(exposures) - place.start - frames if place.backwards else place.start
         of_one = len(exposures[0])
         lead = min(-(-array.lead(NEGLIGIBLE) // of_one), before)
         last = frames - 1
         dy, dx = place.drift
+        # A drifting crop covers more of the clip than its side; the margin must exist at both ends.
         y, x = (sorted((first, first + last * way)) for first, way in ((place.y, dy), (place.x, dx)))
         reach = array.reach
         top = min(reach, y[0])
@@ -178,6 +180,7 @@ class WindowLight:
 
         They equal the cropped codes of `qsim sense` under `place.key`, as far as both draw the same numbers.
         """
+        # Backwards, no stored stream has these codes in this order: their numbers begin anew.
         number = 0 if self.place.backwards else self.exposures.number(self.codes[0])
         origin = (self.draw.origin[0] + self.place.y - self.top, self.draw.origin[1] + self.place.x - self.left)
         of_one = self.photons.shape[1]

@@ -137,6 +137,7 @@ class Windows(Dataset[dict[str, Any]]):
         self.filters = _filters_of_all(alike, self.noise.noises, settings)
         for noise in self.noise.noises:
             _check_codes(alike, noise, settings)
+        # One clip of each kind is checked, as clips of a data set are thousands and mostly alike.
         lit = {clip.camera is None: clip for clip in reversed(alike)}  # of clips that are alike the first
         sized = {(clip.camera is None, clip.shape[1:], clip.origin): clip for clip in reversed(alike)}  # for defects
         for noise in self.noise.noises:
@@ -219,6 +220,7 @@ class Windows(Dataset[dict[str, Any]]):
         turn = turn if turn in fitting else sorted(fitting)[turn % len(fitting)]
         rows, columns = self.filters.tile
         back = [max(0, -step * (self.settings.frames - 1)) for step in drift]
+        # A drift to lower rows ends before its start: the place of the mask counts from the crop's least row.
         y = back[0] + place_in_tile(y - back[0], fitting[turn][0] - back[0], rows)
         x = back[1] + place_in_tile(x - back[1], fitting[turn][1] - back[1], columns)
         return turn, y, x
@@ -269,6 +271,7 @@ class Windows(Dataset[dict[str, Any]]):
         sharp = self._sharp(place, photons)
         scale = 1.0
         if settings.force_exposure and noise.ppp is not None:
+            # As published: every window is exposed to the light level by its own mean, not by that of its clip.
             scale = noise.ppp / max(float((photons if self.filters is None else sharp).mean()), 1e-9)
         try:
             if noise.defects is None and draw.timing == Timing():  # any pixel of the sensor, in its own random numbers
@@ -408,6 +411,7 @@ def shuffled(length: int, seed: tuple[int, int], index: int) -> int:
     parts = -(-length // SHUFFLED)
     if parts == 1:
         return int(_order(length, seed)[index])
+    # The first `longer` parts have one number more; each part is shuffled alone and interleaved with the others.
     least, longer = divmod(length, parts)
     part = min(index // (least + 1), longer)
     if part == longer:

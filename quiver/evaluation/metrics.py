@@ -166,6 +166,8 @@ def _least(values: np.ndarray, goal: np.ndarray) -> float:
         last = start + CHUNK > len(values)  # the piece in which every pixel is at the peak
         ends = np.append(edges, inf) if last else edges
         starts = np.append(edge, edges)[: len(ends)]
+        # Running sums: with each further factor one more pixel reaches the peak and
+        # leaves the parabola a s^2 - 2 b s + c for the constant w.
         a, b, c, w = (
             np.append(total, total + sign * np.cumsum(part))
             for total, sign, part in (
@@ -180,6 +182,7 @@ def _least(values: np.ndarray, goal: np.ndarray) -> float:
         a, b, c, w = (x[: len(ends)] for x in (a, b, c, w))
         with np.errstate(divide="ignore", invalid="ignore"):
             s = np.where(a > 0, b / a, starts)
+        # The parabola of a piece counts within that piece alone: its vertex is moved to the nearer end.
         s = np.clip(np.clip(s, starts, ends), low, high)
         inside = (starts <= high) & (ends >= low)
         errors = np.where(inside, w + s * s * a - 2 * s * b + c, inf)
@@ -217,6 +220,7 @@ def _ssim_frame(output: np.ndarray, target: np.ndarray, keep: np.ndarray | None)
     index = structural_similarity(output, target, win_size=SSIM_WINDOW, data_range=1.0, full=True)[1]
     edge = SSIM_WINDOW // 2
     inner = (slice(edge, -edge), slice(edge, -edge))
+    # A window counts if all of its pixels are kept: the least of them is True.
     kept = index[inner][minimum_filter(keep, SSIM_WINDOW)[inner]]
     return float(kept.mean()) if kept.size else nan
 
@@ -251,6 +255,7 @@ def score_and_factors(
     scaled = one * scales.reshape(-1, *(1,) * (one.ndim - 1))
     matched = psnr(scaled, two, keep)
     if per_frame_scale:
+        # Comparisons with NaN are False: a frame without a matched score keeps its raw one.
         worse = ~(matched >= raw)
     else:
         scored = ~np.isnan(raw)
@@ -311,6 +316,7 @@ def over_scenes(values: Sequence[float], scenes: Sequence[Hashable], confidence:
         return Interval(float(means.mean()) if len(means) else nan, nan, len(means))
     from scipy.stats import t as student
 
+    # Student's interval: the deviation over scenes is itself estimated, from few of them.
     half = float(student.ppf((1 + confidence) / 2, len(means) - 1)) * float(means.std(ddof=1)) / sqrt(len(means))
     return Interval(float(means.mean()), half, len(means))
 

@@ -64,6 +64,7 @@ def merge_inputs(merged: Merged, domain: InformationDomain) -> MergeInputs:
     local = domain.forward(box_mean(mean_code, LOCAL)[0].numpy())
     light = np.interp(local, domain.phi, domain.photons)
     blurred = np.interp(local, domain.phi, domain.slope) * deviation
+    # Light over its noise, in octaves: it tells the network where codes are dark or saturated.
     known = np.log2((light + LEAST_LIGHT) / (blurred + LEAST_LIGHT)).clip(-4, 8) / UNIT
     channels = [
         (phi - local) / (UNIT * deviation),
@@ -89,6 +90,7 @@ def _groups(merged: Merged, around: Array, domain: InformationDomain) -> Array:
 
 def _stabilised(mean_code: Array, count: Array, domain: InformationDomain) -> tuple[Array, Array]:
     """Return phi and its deviation, float32 [H, W], of the mean of `count` codes; half a count below saturation."""
+    # At saturation a mean code tells no light; half a count below, the estimate is that of the moment inverse.
     most = np.maximum(domain.mean_code[-1] - 0.5 / count, domain.mean_code[0])
     mean_code = np.minimum(mean_code, most)
     deviation = domain.noise(mean_code) / np.sqrt(count)

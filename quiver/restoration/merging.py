@@ -46,6 +46,7 @@ def fill_merged(
         for t, merged in enumerate(stream(frame, length, domain, WINDOW, range(first, first + len(out)))):
             restored = corrected(network, merged, domain, options)[:rows, :columns]
             out[(t, *part)] += tile.weight * restored
+            # One frame tells how much tiles differ, as all have the same cut.
             if t == 0 and not pieces.exact:
                 apart.add(tile, restored / np.float32(codes.white))
             done += 1

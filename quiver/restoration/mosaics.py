@@ -65,6 +65,7 @@ def _place(codes: Codes, i: int, j: int) -> Codes:
         return np.ascontiguousarray(codes.read(start, stop)[:, i::rows, j::columns])
 
     shape = (length, len(range(i, height, rows)), len(range(j, width, columns)))
+    # The light behind a filter is the share of the three bands that it passes.
     seen = float(codes.colour.weights(codes.sensor.efficiency)[:, i, j].sum())
     ppp = None if codes.ppp is None else codes.ppp * seen
     name = f"{codes.name}, {codes.colour.mask[i][j]}"

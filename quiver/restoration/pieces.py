@@ -110,6 +110,7 @@ def cores(height: int, width: int, pixels: int, reach: int, multiple: int, least
             (tried, *(np.array([kind(max(b - a, least) for a, b in spans) for spans in ends]) for kind in (max, sum)))
         )
     (tall, most_y, all_y), (wide, most_x, all_x) = found
+    # All pairs of core heights and widths: the total area of their tiles, overlap included, is the work.
     area = np.where(most_y[:, None] * most_x <= pixels, all_y[:, None] * all_x, np.iinfo(np.int64).max)
     y, x = np.unravel_index(np.argmin(area), area.shape)
     if most_y[y] * most_x[x] > pixels:
@@ -131,6 +132,7 @@ def spans(length: int, core: int, reach: int, blend: bool) -> list[tuple[int, Ar
         at = np.arange(first, last)
         shape = ((at >= start) & (at < start + core)).astype(float)
         if blend:
+            # Neighbours overlap by twice the reach; there one falls as the other rises, and both add up to 1.
             rise = (at - start + reach + 1) / (2 * reach + 1) if start else np.ones(len(at))
             fall = (start + core + reach - at) / (2 * reach + 1) if start + core < length else np.ones(len(at))
             shape = np.clip(rise, 0, 1) * np.clip(fall, 0, 1)

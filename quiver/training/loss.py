@@ -63,6 +63,7 @@ def gradients(image: Tensor, operator: str) -> tuple[Tensor, Tensor]:
     """Return the horizontal and vertical gradient of [N, 1, H, W], without border pixels that lack neighbours."""
     if operator == "difference":
         return image[..., :, 1:] - image[..., :, :-1], image[..., 1:, :] - image[..., :-1, :]
+    # Sobel's kernel; its transpose for the other axis.
     kernel = torch.tensor(
         [[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]], dtype=image.dtype, device=image.device
     )

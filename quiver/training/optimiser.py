@@ -32,6 +32,7 @@ class Optimiser:
             if not weight.is_contiguous():
                 raise ValueError(f"{name}: Muon sees kernels as matrices in the same memory; make it contiguous first")
         self.kernels = [weight for _, weight in inner]
+        # Muon takes matrices: a view of a kernel changes the kernel.
         self.matrices = [nn.Parameter(weight.detach().flatten(1)) for weight in self.kernels]  # the same memory
         rest = [weight for _, weight in named if not any(weight is kernel for kernel in self.kernels)]
         self.parts: list[torch.optim.Optimizer] = [torch.optim.Adam(rest, lr=rate, betas=betas, eps=1e-8)]

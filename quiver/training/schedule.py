@@ -73,6 +73,7 @@ def learning_rate(settings: Settings, state: State) -> float:
     rate = settings.learning_rate * min(1.0, rise)
     if settings.schedule == "plateau":
         return rate * 0.5**state.halvings
+    # A cosine to 1 % rather than to 0, with which the last steps would learn nothing.
     return rate * max(0.01, 0.5 * (1 + math.cos(math.pi * share)))
 
 

@@ -105,6 +105,7 @@ class Carrier:
         if t not in self.frames:
             raise ValueError(f"frame {t}: the frames that share samples are {self.frames[0]} to {self.frames[-1]}")
         wanted = [s for s in range(t - self.neighbours, t + self.neighbours + 1) if s in self.frames]
+        # Frames are asked for in order: each is traced once, and forgotten when no later picture needs it.
         for s in set(self._kept) - set(wanted):
             del self._kept[s]
         for s in wanted:
@@ -182,10 +183,12 @@ class _Layers:
         moves = mi.Float(self._moves(traced).astype(np.float32).ravel())
         for part in traced.parts:
             pixel, inverse, seen = self._landed(part, moves)
+            # Halves stay apart when samples are carried: their difference remains a measure of the noise.
             half = dr.arange(mi.UInt32, dr.width(part.body)) // dr.opaque(mi.UInt32, part.each * len(part.pixels))
             layer = dr.select(self._near(pixel, inverse, part.body), mi.UInt32(0), mi.UInt32(2))
             at = pixel + dr.opaque(mi.UInt32, self.pixels) * (half + layer)
             seen &= dr.isfinite(part.radiance)
+            # Sum and number in one integer: one atomic addition instead of two, and the same result in any order.
             steps = mi.Int64(dr.round(part.radiance / dr.opaque(mi.Float, self.step)))
             dr.scatter_add(self.sums, steps * COUNTED + 1, at, seen)
         dr.eval(self.sums)
@@ -194,11 +197,13 @@ class _Layers:
         """Return the mixture of the layers, float64 [2, H, W]; `own` where a layer has no sample."""
         sums, counts = np.divmod(np.array(self.sums).reshape(2, 2, *self.carrier.film.shape), COUNTED)
         means = sums * self.step / np.maximum(counts, 1)
+        # A layer that covers a part of the pixel but got no sample would be black.
         empty = ((counts[0] == 0) & (self.share > 0)) | ((counts[1] == 0) & (self.share < 1))
         return np.where(empty, own, self.share * means[0] + (1 - self.share) * means[1])
 
     def _moves(self, traced: Traced) -> Array:
         """Return the rigid motions from camera axes of a frame to those of t, by body number + 1, [n, 3, 4]."""
+        # Camera then -> world -> body -> world -> camera of frame t: the body's own axes are what a surface keeps.
         moves = np.linalg.inv(self.target.view) @ self.target.bodies @ np.linalg.inv(traced.bodies) @ traced.view
         if traced is not self.target:
             deforming = [n for n, body in enumerate(self.carrier.stage.scene.bodies, 1) if body.deforms]
@@ -220,6 +225,8 @@ class _Layers:
         across = (place.x - middle) / f
         down = (place.y - level) / f
         row = [dr.gather(mi.Float, moves, part.body * 12 + i) for i in range(12)]
+        # Of (x/z, y/z, 1) and 1/z a motion needs no division by a distance that
+        # may be infinite: at infinity the translation counts nothing.
         x1, y1, z1 = (row[i] * across + row[i + 1] * down + row[i + 2] + row[i + 3] * part.inverse for i in (0, 4, 8))
         column = dr.floor(x1 / z1 * f + middle) - x
         line = dr.floor(y1 / z1 * f + level) - y

@@ -181,6 +181,7 @@ def shown_nodes(document: Document, nodes: list[Node], order: list[int], parents
         return
     about = convert(document.content, SceneChoice, str(document.path))
     roots = set(document.entry("scenes", about.get("scene", 0), SceneEntry, "scene").get("nodes", []))
+    # Parents come first, so that a child finds its parent among the roots.
     for i in order:
         if i in roots or parents.get(i) in roots:
             roots.add(i)
@@ -218,6 +219,7 @@ def pieces_of_node(
     """
     node = nodes[number]
     mesh = document.entry("meshes", node["mesh"], MeshEntry, f"nodes[{number}]")
+    # glTF: a skinned mesh follows its bones alone; the transform of its own node is ignored.
     bones = _bones(document, node["skin"], f"nodes[{number}]", joints, joint_of) if "skin" in node else None
     for i, each in enumerate(mesh["primitives"]):
         where = f"meshes[{node['mesh']}].primitives[{i}]"
@@ -367,6 +369,7 @@ def _joined(
     vertices = motion.deform(0.0)
     uv = np.concatenate([piece.uv for piece in pieces])
     longest = float(np.ptp(first, axis=0).max())
+    # Without coordinates of its own a texture is laid on from the front, once over the longest side.
     uv = np.where(np.isnan(uv), vertices[:, :2] / (longest * scale) + 0.5, uv)
     mirrored = np.linalg.det(motion.matrices(moment)[:, :3, :3]) < 0
     faces = [outward(piece, mirrored) + start for piece, start in zip(pieces, starts, strict=False)]
@@ -396,6 +399,7 @@ def unscaled(pieces: list[FilePiece], joints: list[Joint]) -> Skinned:
     """Return all pieces as one motion in the lengths of the file."""
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
     most = max(piece.owners.shape[1] for piece in pieces)
+    # Pieces have other numbers of bones per vertex: those that are missing get the weight 0.
     wide = [((0, 0), (0, most - piece.owners.shape[1])) for piece in pieces]
     return Skinned(
         np.concatenate([piece.vertices for piece in pieces]),
@@ -426,6 +430,8 @@ def _reach(body: Skinned) -> float:
         assert isinstance(joint.motion, Keyed | Fixed)
         factor, shift = joint.motion.bounds()
         above = grown[joint.parent] if joint.parent >= 0 else (1.0, 0.0)
+        # A motion scales a length by at most `factor` and moves it by at
+        # most `shift`; chains of joints multiply and add these.
         grown.append((above[0] * factor, above[0] * shift + above[1]))
     farthest = float(np.linalg.norm(body.rest, axis=1).max())
     for morph in body.morphs:

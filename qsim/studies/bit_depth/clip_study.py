@@ -146,6 +146,8 @@ def expose(
             quiet = quiet + p[..., 0]
             spread = spread + p[..., 0] * p[..., 1]
         if reach:
+            # Differences at odd and at even distances: each new pair is
+            # compared with one plane of the last, and with itself.
             structure[2 * reach - 1] += np.sum((pair[0] - before)[scored] ** 2)
             structure[2 * reach] += np.sum((pair[0] - pair[1])[scored] ** 2)
             before = pair[1]
@@ -167,8 +169,11 @@ class _Sums:
         light = _equivalent(readout, frame)
         mean, variance = readout.moments(light)
         if readout.model == "planes":
+            # A sum of unequal chances varies less than a binomial one: sum
+            # p (1 - p) is at most M p (1 - p) of their mean.
             even = frame.quiet * (1 - frame.quiet / m)  # the variance if all planes saw the same light
             variance = variance * np.minimum(frame.spread / np.maximum(even, 1e-300), 1.0)
+        # One drawn code, and beside it the expectation of its squared error: bias squared plus variance.
         simulated = (readout.estimates[codes] / m - sharp) ** 2
         predicted = (mean / m - sharp) ** 2 + variance / m**2
         sensor = readout.sensor
@@ -198,6 +203,7 @@ def _equivalent(readout: Readout, frame: Exposed) -> Array:
     sensor = readout.sensor
     mean_quiet = np.maximum(frame.quiet / frame.planes, 1e-290)
     if sensor.sums_planes:
+        # A plane stays dark with exp(-arrivals): the inverse of its law.
         arrivals = -np.log(mean_quiet) - sensor.dark_rate * readout.exposure
         return frame.planes * np.maximum(arrivals, 0.0) / sensor.efficiency
     grid = np.append(0.0, np.geomspace(1e-5, 1.0, 4 * GRID) * 4 * max(frame.photons.max() / frame.planes, 1e-12))

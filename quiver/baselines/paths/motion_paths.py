@@ -121,6 +121,8 @@ def correct(
     fast = float(k @ k)
     if fast == 0:
         return velocity, acceleration
+    # Where the reference is not in the middle of the window, k and k^2 / 2 go
+    # together; without that their equations fall apart into two.
     mix = float(k @ q) / fast
     q = q - mix * k
     bent = float(q @ q)
@@ -135,6 +137,7 @@ def correct(
     )
     yy, xx, yx, *pulls = smooth_mean(products, radius) * (information * (2 * radius + 1) ** 2)
     far = max(abs(offset) for offset in offsets)
+    # A prior on the size of a correction keeps blocks with one edge, or none, from running along it.
     prior = (scale / CORRECTION) ** 2
     dv = _limited(_solved(yy * fast + prior, yx * fast, xx * fast + prior, -torch.stack(pulls[:2])), 1.5 / far)
     da = torch.zeros_like(dv)
@@ -145,6 +148,7 @@ def correct(
     moved = torch.cat([velocity + scale * (dv - mix * da), acceleration + scale * da])
     told = yy + xx
     sums = smooth_mean(torch.cat([moved * (told + 1), (told + 1)[None]]), radius)
+    # Flat blocks know nothing of their motion, and follow those around that do.
     moved = torch.lerp(moved, sums[:4] / sums[4], STIFFNESS / (STIFFNESS + told))
     return moved[:2], moved[2:]
 
@@ -164,6 +168,7 @@ def _errors(
     inside = torch.stack(votes)
     mean = (moved * inside).sum(0) / inside.sum(0)
     misfit = box_mean((moved - mean).square_(), 1) * (scale**2 / MISFIT)
+    # Robust weights: what fits badly loses its vote, without a threshold.
     vote = inside / (1 + misfit.square_())
     mean = (moved * vote).sum(0) / vote.sum(0).clamp_(min=1e-6)
     return mean, (moved - mean).mul_(vote), vote.mean(0)

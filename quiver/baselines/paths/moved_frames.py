@@ -53,6 +53,7 @@ def _sums(x: Tensor, count: int, dim: int) -> Tensor:
 def kept_noise(moved: Tensor) -> Tensor:
     """Return the share of the noise's variance [..., H, W] that is left at p + moved [2, ..., H, W], seen by `look`."""
     part = moved - moved.floor()
+    # The sum of squared bilinear weights: between pixels a mean of two has half of the noise.
     share = part.square() + (1 - part).square()
     return share[0] * share[1]
 

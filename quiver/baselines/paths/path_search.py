@@ -39,6 +39,7 @@ def search(frames: Tensor, offsets: Sequence[int], scale: int, speed: float) -> 
         return torch.zeros(2, *reference.shape)
     for frame, offset in voters:
         _add_misfits(misfits, inside, reference, frame, offset, most, scale)
+    # Noise alone would always prefer some motion to none among so many that are tried.
     pace = torch.arange(-most, most + 1, dtype=frames.dtype).abs() * (STEP * scale)
     pace = (pace[:, None] + pace).flatten()
     unit = SCALES[0] // scale
