@@ -15,7 +15,8 @@ from manual import api, examples, mathml, menu
 _PAGE = re.compile(r"^<!-- page: (\S+) -->$", re.MULTILINE)
 _SHELL = re.compile(r"^```sh\n.*?^```$", re.MULTILINE | re.DOTALL)
 _COMMANDS = re.compile(r'<div class="highlight-sh .*?</pre>', re.DOTALL)
-_OPTION = re.compile(r"(?<=>)(--?[a-z][a-z-]*)(?=[<\n])")
+_TEXT = re.compile(r"(?<=>)[^<]+")
+_HYPHENED = re.compile(r"(?<![\w-])(?:--?[a-z][\w-]*|\w+(?:-\w+)+)")  # an option, or a name such as qbp-bm3d
 _BEHIND = re.compile(r"(?<!\\\n)^(\S.*?) {2,}(# .*)$", re.MULTILINE)
 
 
@@ -24,7 +25,7 @@ def setup(app: Any) -> dict[str, Any]:
     app.connect("builder-inited", api.write_pages)
     app.connect("autodoc-process-docstring", api.convert_docstring)
     app.connect("source-read", _insert)
-    app.connect("html-page-context", _keep_options)
+    app.connect("html-page-context", _keep_names)
     app.connect("build-finished", examples.write_downloads)
     mathml.setup(app)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
@@ -48,12 +49,16 @@ def comments_above(text: str) -> str:
     return _SHELL.sub(lambda block: _BEHIND.sub(r"\2\n\1", block[0]), text)
 
 
-def _keep_options(app: Any, page: str, template: str, context: dict[str, Any], tree: Any) -> None:
-    """Keep the options of a page's commands in one line each."""
+def _keep_names(app: Any, page: str, template: str, context: dict[str, Any], tree: Any) -> None:
+    """Keep the options and names in a page's commands in one line each."""
     if "body" in context:
-        context["body"] = options_in_one_piece(context["body"])
+        context["body"] = names_in_one_piece(context["body"])
 
 
-def options_in_one_piece(html: str) -> str:
-    """Return a page whose options are marked in shell commands: browsers would break `--bits` behind its dashes."""
-    return _COMMANDS.sub(lambda block: _OPTION.sub(r'<span class="option">\1</span>', block[0]), html)
+def names_in_one_piece(html: str) -> str:
+    """Return a page with marked names in shell commands: browsers would break `--bits` at its dashes."""
+
+    def marked(text: re.Match[str]) -> str:
+        return _HYPHENED.sub(r'<span class="name">\g<0></span>', text[0])
+
+    return _COMMANDS.sub(lambda block: _TEXT.sub(marked, block[0]), html)

@@ -45,6 +45,12 @@ def _sentence(text: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return a text of `--help` as Markdown: characters with a meaning are escaped outside of code."""
+    """Return a text of `--help` as Markdown: outside of code characters are escaped, and options become code."""
     parts = re.split(r"(`[^`]*`)", text)
-    return "".join(part if part[:1] == "`" else re.sub(r"([*_<>\[\]|$\\])", r"\\\1", part) for part in parts)
+    return "".join(part if part[:1] == "`" else _plain(part) for part in parts)
+
+
+def _plain(text: str) -> str:
+    """Return a text without code as Markdown; plain dashes of an option would be set as one dash."""
+    escaped = re.sub(r"([*_<>\[\]|$\\])", r"\\\1", text)
+    return re.sub(r"(?<![\w-])--[a-z][a-z-]*", r"`\g<0>`", escaped)

@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 sys.path.append(str(DOCS))
 
-from manual import api, comments_above, generated, mathml, menu, options_in_one_piece, rooms  # noqa: E402
+from manual import api, comments_above, generated, mathml, menu, names_in_one_piece, rooms  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -231,18 +231,24 @@ def test_the_manual_builds_strictly_and_loads_nothing_from_elsewhere(tmp_path):
     assert 'id="qsim.sensor.QIS.white"' in texts[site / "api" / "qsim.sensor.html"]
 
 
-def test_options_of_commands_are_kept_in_one_piece():
+def test_names_in_commands_are_kept_in_one_piece():
     pytest.importorskip("pygments")
     from pygments import highlight
     from pygments.formatters import HtmlFormatter
     from pygments.lexers import BashLexer
 
-    block = highlight(
-        "quiver train out/a-b -o out/c --preset mergenet\nmake --keep-going\n", BashLexer(), HtmlFormatter()
-    )
+    block = highlight("quiver evaluate out/a-b -o out/c --methods moment,qbp-bm3d\n", BashLexer(), HtmlFormatter())
     page = f'<p>--preset</p><div class="highlight-sh notranslate">{block}</div>'
-    marked = re.findall(r'<span class="option">(.*?)</span>', options_in_one_piece(page))
-    assert marked == ["-o", "--preset", "--keep-going"]
+    marked = re.findall(r'<span class="name">(.*?)</span>', names_in_one_piece(page))
+    assert marked == ["a-b", "-o", "--methods", "qbp-bm3d"]
+    assert re.sub(r"<.*?>", "", names_in_one_piece(page)) == re.sub(r"<.*?>", "", page)
+
+
+@pytest.mark.parametrize("page", ["qsim.md", "quiver.md"])
+def test_options_in_a_sentence_are_code(page):
+    """Plain dashes would become a dash: the manual sets --force as an en dash and a word."""
+    text = re.sub(r"^```.*?^```|`[^`]*`", "", (DOCS / page).read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    assert re.findall(r"(?<![\w<-])--[a-z][\w-]*", text) == []
 
 
 # Colours
