@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from qsim import llvm
 from qsim.files import wording, write_bytes
@@ -109,14 +109,33 @@ def limit_threads() -> None:
             dr.set_thread_count(int(wanted))
 
 
-def report() -> dict[str, Any]:
-    """Return what `qsim doctor` prints about rendering: the choice, every probe, versions, cache file."""
+class EngineReport(TypedDict):
+    """What `qsim doctor` prints about rendering."""
+
+    variant: str  # the choice, as `RenderEngine`
+    backend: str
+    llvm_path: str | None
+    reason: str
+    probes: list[dict[str, object]]  # every `Probe`
+    software: dict[str, str]  # versions
+    cache: str  # file
+
+
+def report() -> EngineReport:
+    """Return the choice of the renderer, and what led to it."""
     engine = choose()
     cuda = probe_cuda()
     stored = _cached_probes()
     probes = [asdict(probe) for probe in (stored if cuda in stored else [cuda, *stored])]  # one that passes is not kept
-    software = {"mitsuba": version("mitsuba"), "drjit": version("drjit")}
-    return asdict(engine) | {"probes": probes, "software": software, "cache": str(_cache_file() or "none (no home)")}
+    return EngineReport(
+        variant=engine.variant,
+        backend=engine.backend,
+        llvm_path=engine.llvm_path,
+        reason=engine.reason,
+        probes=probes,
+        software={"mitsuba": version("mitsuba"), "drjit": version("drjit")},
+        cache=str(_cache_file() or "none (no home)"),
+    )
 
 
 def decide(wanted: str | None) -> RenderEngine:

@@ -35,19 +35,21 @@ def doctor(asked: Doctor) -> int:
     from qsim.optics.diffraction import diffraction_line
 
     missing = {extra: [p for p in packages if not find_spec(p)] for extra, (packages, _) in OPTIONAL.items()}
-    report = backend.report() | {
+    report = backend.report()
+    facts = {
+        **report,
         "extras": {extra: not packages for extra, packages in missing.items()},
         "lens": diffraction_line(Camera(8e-3, 2.8, 1.1e-6, 512, 1024)),
     }
-    width = max(len(key) for key in report)
+    width = max(len(key) for key in facts)
     extras = [f"{extra}: {_extra_text(extra, packages)}" for extra, packages in missing.items()]
     probes = [f"{p['library'] or p['backend']}: {p['detail']}" for p in report["probes"]]
-    words = report | {
+    words = facts | {
         "probes": ("\n" + " " * (width + 2)).join(probes),
         "software": ", ".join(f"{name} {found}" for name, found in report["software"].items()),
         "extras": ("\n" + " " * (width + 2)).join(extras),
     }
-    output(report, [f"{key:{width}}  {value}" for key, value in words.items()])
+    output(facts, [f"{key:{width}}  {value}" for key, value in words.items()])
     return 0
 
 

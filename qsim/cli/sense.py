@@ -14,6 +14,7 @@ from qsim.kinds import Text
 from qsim.settings import setting, settings_of
 from qsim.streams import storing
 from qsim.streams.sensing import Sensing
+from qsim.streams.stream import Stream
 from qsim.streams.stream_info import StreamInfo
 
 
@@ -68,14 +69,13 @@ def sense(asked: Sense, wanted: Annotated[tuple[Sensing, ...], {"sensor": "quive
     if asked.replay:
         return _replay(asked, clips, wanted[0])
     made = []
+    lines = []
     for clip, (found, line), drawn in drawings(clips, wanted, partial(storing.sense, force=asked.force), "sensing"):
         facts = {"clip": str(clip.path), "stream": found.name, "file": str(found.path), "made": drawn}
-        facts["light"] = line
-        facts["rates"] = found.rates
-        made.append(facts | _light(found.info))
+        made.append({**facts, "light": line, "rates": found.rates, **_light(found.info)})
+        lines.append(f"{'wrote' if drawn else 'exists already:'} {found.path}: {_codes(found)}; {line}")
     if len(wanted) > 1:
         note("streams of a clip with the same --seed share their random numbers: another --seed makes them independent")
-    lines = [_line(m) for m in made]
     output({"streams": made}, lines)
     return 0
 
@@ -101,12 +101,10 @@ def drawings(
                 yield clip, found, bool(drawn)
 
 
-def _line(made: dict[str, Any]) -> str:
-    """Return what was written where: `wrote STREAM.npy: 21 codes of 3 bits, 128 x 128 pixels, RATES; light ...`."""
-    frames, height, width = made["shape"]
-    kind = f"{frames} codes of {made['bits']} bit{'s' if made['bits'] > 1 else ''}, {height} x {width} pixels"
-    begun = "wrote" if made["made"] else "exists already:"
-    return f"{begun} {made['file']}: {kind}, {made['rates']}; {made['light']}"
+def _codes(made: Stream) -> str:
+    """Return what a stream holds, as in `21 codes of 3 bits, 128 x 128 pixels, RATES`."""
+    frames, height, width = made.shape
+    return f"{frames} codes of {made.bits} bit{'s' if made.bits > 1 else ''}, {height} x {width} pixels, {made.rates}"
 
 
 def _light(info: StreamInfo) -> dict[str, object]:
