@@ -105,6 +105,7 @@ def render_seed(job: Job) -> int:
     """Return the seed of the job's samples, which differs from clip to clip."""
     from qsim import keys
 
+    # The renderer takes seeds of 31 bits.
     return (keys.hash_name(job.name) ^ job.seed) & 0x7FFFFFFF
 
 
@@ -174,6 +175,7 @@ def run_job(job: Job, folder: Path, make: RenderJob = render_job) -> Result:
                 return Result(job.name, "done")
             return _do(job, folder, make)
         except Exception as error:
+            # These are no fault of the job: the whole run has to stop.
             if isinstance(error, OSError) and (error.errno in files.FULL or removed(folder)):
                 raise
             _log(folder, job.key, traceback.format_exc())
@@ -208,6 +210,7 @@ def _do(job: Job, folder: Path, make: RenderJob) -> Result:
     for sensing in job.streams:
         _, line = sense(clip, sensing)
         _log(folder, job.key, line)
+    # The record comes last, because its presence means that the job is done.
     descriptions.write(record_path(folder, job.key), JobRecord.of(job))
     failure_path(folder, job.key).unlink(missing_ok=True)
     seconds = (rendered - started, time.monotonic() - rendered)

@@ -90,6 +90,7 @@ def _twice(section: int, name: str) -> ValueError:
 def _overlapping(sections: Sequence[JobSeries], numbers: Sequence[int]) -> Iterator[tuple[Run, Run]]:
     """Yield each two runs of different sections that have seeds in common."""
     open_runs: list[Run] = []
+    # A sweep along the seeds: runs that ended before this one began cannot meet it or any later one.
     for run in sorted(run for number in numbers for run in _runs(sections[number].seeds, number)):
         open_runs = [other for other in open_runs if other.last >= run.first]
         yield from ((other, run) for other in open_runs if other.section != run.section)

@@ -85,9 +85,12 @@ def _plugin(mi: Any) -> Any:  # noqa: C901  a class per variant, whose methods a
             cosine = dr.dot(wi, half)
             facet = glossy(facets(alpha), wi, wo, half)
             coat = schlick(self.reflection, cosine)
+            # glTF 2.0, Appendix B.2: a dielectric is Lambertian below a Fresnel coat, a metal is
+            # the coat alone with the base colour as its reflection; metal mixes both.
             first = (1.0 - coat) * base * dr.inv_pi * wo.z + coat * facet
             found = first + (schlick(base, cosine) * facet - first) * metal
             if self.coated:
+                # KHR_materials_clearcoat: what the second coat reflects does not reach the layers below.
                 seen = self.coat * schlick(COAT_REFLECTION, wi.z)
                 second = glossy(facets(self.coat_alpha), wi, wo, half) * schlick(COAT_REFLECTION, cosine) * self.coat
                 found = found * (1.0 - seen) + second
@@ -97,6 +100,7 @@ def _plugin(mi: Any) -> Any:  # noqa: C901  a class per variant, whose methods a
             base, metal, alpha = self._of(si, active)
             second, facet = self._shares(base, metal)
             half = dr.normalize(wi + wo)
+            # From the density of the half vector to that of the direction (Walter et al., EGSR 2007, eq. 14).
             turned = 1.0 / (4.0 * dr.maximum(dr.dot(wo, half), 1e-6))
             found = facet * facets(alpha).pdf(wi, half) * turned
             found += (1.0 - facet) * mi.warp.square_to_cosine_hemisphere_pdf(wo)
@@ -125,6 +129,7 @@ def _plugin(mi: Any) -> Any:  # noqa: C901  a class per variant, whose methods a
                 chosen = dr.select(coated, facets(self.coat_alpha).sample(wi, sample2)[0], chosen)
                 shown = (shown - second) / (1.0 - second)
             glossy_one = shown < facet  # also where the second coat was chosen: its share is below 0
+            # Facets are mirrors: the chosen half vector reflects the incoming direction.
             reflected = 2.0 * dr.dot(wi, chosen) * mi.Vector3f(chosen) - wi
             wo = dr.select(glossy_one, reflected, mi.warp.square_to_cosine_hemisphere(sample2))
             active &= wo.z > 0

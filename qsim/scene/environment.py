@@ -60,14 +60,18 @@ def sky_map(light: SunSky, rows: int = SKY_ROWS) -> Array:
     up = np.cos(zenith) + 0 * azimuth
     direction = np.stack([np.sin(zenith) * np.sin(azimuth), up, np.sin(zenith) * np.cos(azimuth)], -1)
     chi = np.arccos(np.clip(direction @ sun_direction(light), -1, 1))
+    # Towards the horizon 1 / cos Z diverges; b < 0 sends the
+    # exponential to 0 there, and the bound avoids a division by 0.
     phi = 1 + _A * np.exp(_B / np.maximum(up, 1e-3))
     sky = phi * (1 + _C * (np.exp(_D * chi) - math.exp(_D * np.pi / 2)) + _E * np.cos(chi) ** 2)
     above = up > 0
+    # Both angles have steps of pi / rows. The sum over the upper half is the irradiance of a level surface.
     solid_angle = np.sin(zenith) * (np.pi / rows) ** 2
     irradiance = float(np.sum((sky * up * solid_angle)[above]))
 
     def seen(sun: float, blue: float) -> Array:
         """Return the map of one band from the irradiance of sun and sky."""
+        # Lambertian ground: radiance = reflectance x irradiance / pi.
         sunlit = sun * max(math.sin(light.elevation), 0.0)
         ground = light.ground_reflectance * (sunlit + blue) / np.pi
         return np.where(above, sky * blue / irradiance, ground).astype(np.float32)

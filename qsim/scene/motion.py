@@ -190,6 +190,8 @@ class Shake(Motion):
 
     def velocity(self, t: float) -> tuple[Array, Array]:
         angle = _sum(self.turns, t)
+        # Rotation vectors do not add: the left Jacobian turns the rate of the vector
+        # into an angular velocity (Solà, Deray and Atchuthan, arXiv:1812.01537).
         angular = left_jacobian(angle) @ _sum_rate(self.turns, t)
         linear, _ = _swing(about(exponential(angle), self.center), angular, self.center)
         return linear + _sum_rate(self.shifts, t), angular
@@ -232,6 +234,7 @@ class Keyframes(Motion):
             return np.zeros(3), np.zeros(3)
         i, s, length = interval(self.times, t)
         p = np.asarray(self.positions)
+        # Derivatives of the four cubic Hermite polynomials in s, whose slopes are per interval.
         m = slopes(self.times, np.asarray(self.positions)) * length
         rate = (
             6 * (s**2 - s) * (p[i] - p[i + 1]) + (3 * s**2 - 4 * s + 1) * m[i] + (3 * s**2 - 2 * s) * m[i + 1]
@@ -241,6 +244,7 @@ class Keyframes(Motion):
     def _turn(self, i: int) -> tuple[Array, Array]:
         """Return the rotation at key i [3, 3], and the rotation vector [3] in world axes from it to key i + 1."""
         start, end = (exponential(np.asarray(self.turns[j])) for j in (i, i + 1))
+        # end = step @ start, so that the step turns about axes that stay in the world while the body turns.
         return start, logarithm(end @ start.T)
 
 
@@ -268,6 +272,7 @@ class Composition(Motion):
         turn = self.outer.pose(t)[:3, :3]
         linear, angular = self.outer.velocity(t)
         inner_linear, inner_angular = self.inner.velocity(t)
+        # A point in a turning frame: the frame's own velocity, omega x arm, and the velocity within the frame.
         arm = turn @ self.inner.pose(t)[:3, 3]
         return linear + np.cross(angular, arm) + turn @ inner_linear, angular + turn @ inner_angular
 

@@ -76,6 +76,7 @@ def _check_bits(counts: Counts, bits: int) -> None:
 
 def mean_square(output: Array, target: Array, noise: Array) -> float:
     """Return the mean squared error of clamped images [H, W], in units of the peak, without the target's variance."""
+    # E (x - y)^2 = (x - truth)^2 + var y: what the target's own noise adds is taken off.
     squares = (np.clip(output, 0, 1) - np.clip(target, 0, 1)) ** 2
     return float(squares.mean() - metrics.clamped_variance(target, noise).mean())
 
@@ -92,6 +93,7 @@ def score_split(
 
     `given` are the frames to restore from, `peak` is in photons.
     """
+    # The target is made of the other frames, so that its noise is independent of the method's.
     centre = len(given) // 2
     codes = counted(counts, bits, given)
     first, last = (centre, centre + 1) if method.seamless else (0, len(given))  # a state needs the complete stream

@@ -251,6 +251,8 @@ class _Reading:
         if min(tinted) != max(tinted):
             self._tell("its specular colour is taken as its luminance")
         share = about.get("specularFactor", 1.0) * float(luminance(np.array(tinted)))
+        # Fresnel at normal incidence: ((n - 1) / (n + 1))^2. The specular share scales that, and the index
+        # is what would reflect so. KHR_materials_ior means total reflection by an index of 0.
         given = self._extension("KHR_materials_ior", Ior).get("ior", 1.5)
         reflected = 1.0 if given == 0 else ((given - 1) / (given + 1)) ** 2
         root = math.sqrt(min(max(reflected * share, 0.0), 0.9))

@@ -92,6 +92,7 @@ class Skinned(Motion):
         """Return the matrix of every joint, from rest to a time [s] of the animation, float64 [joints, 4, 4]."""
         found: list[Array] = []
         for joint in self.joints:
+            # A parent comes before its children in the list, so that its matrix is known here.
             own = np.asarray(joint.motion.pose(moment), np.float64)
             found.append(own if joint.parent < 0 else found[joint.parent] @ own)
         return np.array(found)
@@ -106,6 +107,7 @@ class Skinned(Motion):
             matrices = self.matrices(moment)
             shape = self._morphed(moment)
             moved = np.zeros_like(shape)
+            # Linear blend skinning (glTF 2.0, 3.7.3.3): each vertex is the mean of where its joints would put it.
             for owners, shares in zip(self.owners.T, self.shares.T, strict=True):
                 chosen = matrices[owners]
                 moved += shares[:, None] * (np.einsum("vij,vj->vi", chosen[:, :3, :3], shape) + chosen[:, :3, 3])

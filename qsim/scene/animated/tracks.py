@@ -119,8 +119,10 @@ class Track:
             return _unit(self.at(t))
         start = _unit(self.values[i])
         end = _unit(self.values[i + 1])
+        # q and -q are one rotation; the nearer of them gives the shorter way.
         end = end if start @ end >= 0 else -end
         angle = 2 * np.arctan2(np.linalg.norm(end - start), np.linalg.norm(end + start))  # at most pi / 2
+        # sin(x a) / sin(a) as a ratio of sincs, which stays exact where the angle vanishes.
         shares = [x * np.sinc(x * angle / np.pi) / np.sinc(angle / np.pi) for x in (1 - s, s)]
         return _unit(shares[0] * start + shares[1] * end)
 

@@ -177,6 +177,7 @@ class _Sums:
         simulated = (readout.estimates[codes] / m - sharp) ** 2
         predicted = (mean / m - sharp) ** 2 + variance / m**2
         sensor = readout.sensor
+        # Of an ideal counter: Poisson variance of the electrons, referred to photons per clip frame.
         arrivals = sensor.efficiency * frame.photons + sensor.dark_rate * _duration(readout)
         blur = (frame.photons / m - sharp) ** 2
         shot = arrivals / (m * sensor.efficiency) ** 2
@@ -206,6 +207,7 @@ def _equivalent(readout: Readout, frame: Exposed) -> Array:
         # A plane stays dark with exp(-arrivals): the inverse of its law.
         arrivals = -np.log(mean_quiet) - sensor.dark_rate * readout.exposure
         return frame.planes * np.maximum(arrivals, 0.0) / sensor.efficiency
+    # Other planes have no law that can be inverted: P(dark) falls with light, so its negative rises as interp needs.
     grid = np.append(0.0, np.geomspace(1e-5, 1.0, 4 * GRID) * 4 * max(frame.photons.max() / frame.planes, 1e-12))
     return frame.planes * np.interp(-mean_quiet, -sensor.pmf(grid, readout.exposure)[:, 0], grid)
 

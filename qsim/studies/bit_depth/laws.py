@@ -75,11 +75,13 @@ class Structure:
     def at(self, lags: Array) -> Array:
         """Return D at lags of any shape [planes]: interpolated over squared lags, constant after the last."""
         known = np.arange(len(self.values), dtype=float)
+        # D(k) grows as k^2 at short lags, where motion is linear: straight over k^2.
         return np.interp(np.asarray(lags, float) ** 2, known**2, self.values)
 
     def blur(self, planes: int, speed: float = 1.0) -> float:
         """Return the mean square error [photons^2] of a frame against its sharp middle, at `speed` times the motion."""
         k = np.arange(1, planes)
         s = np.arange(planes) - planes // 2
+        # The formula of the class; lags within the frame, each k seen M - k times.
         within = float(np.sum((planes - k) * self.at(speed * k))) / planes**2
         return max(float(np.mean(self.at(speed * np.abs(s)))) - within, 0.0)

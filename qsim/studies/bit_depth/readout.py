@@ -74,6 +74,7 @@ class Readout:
     def estimates(self) -> Array:
         """The maximum-likelihood light [photons per frame] for codes 0 ... M, float64 [M + 1]."""
         if self.model == "multibit":
+            # Without read noise some codes have probability 0 at any light, and no estimate.
             some = np.append(0.0, np.geomspace(1e-6, 1e2, 800)) * self.sensor.white(self.exposure)
             possible = (
                 self.sensor.pmf(some, self.exposure).max(axis=0) > 0
@@ -100,6 +101,7 @@ class Readout:
         """
         top = float(photons.max())
         grid = np.append(0.0, np.geomspace(max(float(photons.min()), 1e-5 * top), 1.0001 * top, GRID))
+        # The geometric grid starts low enough that pixels between it and 0 do not matter to a mean error.
         pmf = self.pmf(grid)
         mean = pmf @ self.estimates
         variance = (pmf * (self.estimates - mean[:, None]) ** 2).sum(axis=1)
@@ -110,6 +112,7 @@ class Readout:
         if self.model == "multibit":
             information = float(self.sensor.fisher_information(np.array(photons), self.exposure))
         else:
+            # M planes add their information; with light / M in each, the change of variable divides it by M^2.
             per_plane = self.sensor.fisher_information(np.array(photons / self.planes), self.exposure)
             information = float(per_plane) / self.planes
         return 20 * math.log10(photons * math.sqrt(information)) if information > 0 else -math.inf

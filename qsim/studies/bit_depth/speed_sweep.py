@@ -155,6 +155,7 @@ def law(base: Study, clip: Clip, settings: StudySettings, model: str, speed: flo
     whole = float(np.mean([frame.mean() for frame in frames.values()]))
     seen = replace(settings, speed=base.speed)
     light = np.concatenate([frame[scored_pixels(clip, t, seen)] for t, frame in frames.items()])
+    # About 4000 quantiles stand for all pixels: the noise depends on the light alone.
     light = np.sort(light)[:: max(1, light.size // 4000)] * (ppp / whole)
     scale = (ppp / base.ppp) ** 2
     result = {}
@@ -162,6 +163,7 @@ def law(base: Study, clip: Clip, settings: StudySettings, model: str, speed: flo
         if form.model == model:
             mean, variance = form.moments(form.planes * light)
             noise = float(np.mean((mean / form.planes - light) ** 2 + variance / form.planes**2))
+            # The structure function is in photons^2, hence the squared ratio of light.
             error = noise + scale * base.structure.blur(form.planes, speed)
             result[form.bits] = psnr(base.peak * math.sqrt(scale), math.sqrt(error))
     return result

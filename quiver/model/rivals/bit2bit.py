@@ -105,8 +105,12 @@ class Bit2Bit(nn.Module):
         planes = self.config.planes
         output = self.output(planes * frames, frames.new_ones(len(frames))).to(frames.dtype)
         if not self.config.as_published:
+            # The network gives the logit of the probability pi that a plane fires;
+            # -ln(1 - sigmoid(x)) = softplus(x) are the photons of a plane.
             return F.softplus(output) - self.config.dark  # -ln(1 - pi)
         pixels = frames.shape[-2] * frames.shape[-1]
+        # As published the output is a distribution of each frame's photons
+        # over its pixels: a softmax, times the photons that the frame has.
         brightness = output - output.flatten(2).logsumexp(2).view(*output.shape[:2], 1, 1, 1)
         return frames.mean(dim=(2, 3, 4), keepdim=True) * pixels * brightness.exp() - self.config.dark
 
@@ -116,6 +120,7 @@ class Bit2Bit(nn.Module):
         height, width = seen.shape[-2:]
         order = reflected(0, -(-count // self.multiple) * self.multiple, count)
         volume = pad_space(seen, self.multiple)[:, order].transpose(1, 2)  # [B, 1, T, H, W]
+        # Counts from 0 to many powers of ten, each seen at a scale where a network can tell them apart.
         channels = [torch.sin(volume * 10.0**-i) for i in range(FREQUENCIES)]
         if not self.config.as_published:
             channels.append(share.to(seen.dtype).view(-1, 1, 1, 1, 1).expand_as(volume))

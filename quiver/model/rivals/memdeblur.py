@@ -262,6 +262,7 @@ class Memory(nn.Module):
         self.decoder_mem = Decoder(width)
         self.decoder_feat = Decoder(width)
         self.attention = Attention()
+        # As in STCN (Cheng, Tai and Tang, NeurIPS 2021), whose memory this is.
         nn.init.orthogonal_(projection.weight)
         nn.init.zeros_(projection.get_parameter("bias"))
 
@@ -300,6 +301,7 @@ class Attention(nn.Module):
             dtype = torch.promote_types(query.dtype, torch.float32)
             keys, values = (x.to(dtype) for x in stored)
             queries = query.flatten(2).to(dtype)
+            # -|k - q|^2 without |q|^2, which is the same for all keys of a query, and which softmax ignores.
             nearness = 2 * keys.mT @ queries - keys.square().sum(dim=1)[..., None]
             nearness = nearness / math.sqrt(keys.shape[1])  # [B, n, h w]
             if not self.training and nearness.shape[1] > NEAREST:

@@ -186,6 +186,7 @@ def feature_distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _standardised(features: Tensor) -> Tensor:
+    # Scales and offsets of features are free; only their pattern is taught.
     x = features.float()
     variance, mean = torch.var_mean(x, dim=(2, 3), correction=0, keepdim=True)
     return (x - mean) / (variance + LEAST_VARIANCE).sqrt()
