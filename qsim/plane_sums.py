@@ -182,6 +182,7 @@ class Sums:
         """Return the sum [H, W] of the planes from `first` on, read in blocks of PLANE_PIXELS."""
         stop = first + self.planes
         block = read(first, first + 1)
+        # Planes are read in blocks: a code of 16 bits sums up to 65535 of them.
         total = block[0].astype(np.uint16)
         together = max(1, PLANE_PIXELS // block[0].size)
         for at in range(first + 1, stop, together):

@@ -51,6 +51,7 @@ def dark_rates(darks: Sequence[FrameStatistics], response: Response) -> DarkRate
         room = most_counts(here) * stack.frames - stack.total
         used = (room >= LINEAR) | (weight == 0)
         time = stack.frames * stack.exposure
+        # Mean of the rates of all stacks, each weighted with the time that it looked.
         rate += np.where(used, time * arrivals.value / stack.exposure, 0)
         variance += np.where(used, arrivals.variance * (time / stack.exposure) ** 2, 0)
         weight += np.where(used, time, 0)
@@ -84,6 +85,8 @@ def too_bright(flat: FrameStatistics, good: Array, response: Response) -> bool:
     if response.bits > 1:
         full = flat.total[good] >= t * (flat.histogram.size - 1)
         return float(full.mean()) > 1e-3
+    # -log(1 - q) = sum of q^n / n, of which T planes estimate the first T terms without bias: the rest
+    # of the series is the bias, its variance that of the delta method, q / ((1 - q) T).
     q = (flat.total[good] + 0.0) / (t + 0.5)
     bias = float(np.mean(q ** (t + 1) / ((t + 1) * (1 - q))))
     error = np.sqrt(float(np.mean(q / (1 - q))) / (t * q.size))
@@ -109,6 +112,7 @@ def spad_flats(flats: Sequence[FrameStatistics], darks: DarkRates | None, hot: A
             slope = 1 - mean
             level = 1 - slope * np.exp(np.clip(dark - average, -30.0, 30.0))
         else:
+            # Moves each pixel along the curve of codes to the mean dark rate, so that only its efficiency is left.
             slope = np.interp(arrivals - average, light, np.gradient(codes, light))
             level = mean - slope * (dark - average)
         in_time = flat.pixel_variance / flat.frames * _excess(here, mean, flat.frames)
@@ -164,6 +168,7 @@ def _table(mean: Array, good: Array, curve: Callable[[Array], Array], largest: f
     """Return (light, mean code) [G] up to `WIDEST` times the brightest light of the flat's smooth surface."""
     basis = surface(mean.shape, int(good.sum()))
     fitted = smooth_part(basis, mean.ravel(), good.ravel())
+    # Squares are dense near 0, where the code of a pixel bends most in relative terms.
     light = np.linspace(0, np.sqrt(max(largest, 1e-9)), 600) ** 2
     codes = curve(light)
     rising = int(np.argmax(codes)) + 1
@@ -187,5 +192,7 @@ def _dark_level(darks: Sequence[FrameStatistics], exposure: float) -> tuple[Arra
     centre = float(weight @ time)
     spread = float(weight @ (time - centre) ** 2)
     if not same and spread > 0:
+        # A straight line by weighted least squares is a weighted mean, too; at
+        # the centre of the exposures its weights are unchanged.
         weight = weight * (1 + (exposure - centre) * (time - centre) / spread)
     return np.tensordot(weight, means, 1), np.tensordot(weight**2, variances, 1)

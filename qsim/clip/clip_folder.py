@@ -257,6 +257,7 @@ class ClipFolder:
         """Raise `ValueError` if the folder became another clip since this one was opened."""
         described = self.path / "clip.json"
         try:
+            # The file's state is cheap to compare; checksums are read only where it has changed, as by a copy.
             state = _state(described)
             if state == getattr(self, "_seen", None):
                 return

@@ -239,6 +239,7 @@ def _damage(folder: Path, job: Job) -> _Damage:
     if record in damaged:
         light = damaged == {record}
     else:
+        # Streams are drawn from the clip in seconds; anything else means that the clip is rendered again.
         light = all(path.parent == clip / "streams" for path in damaged)
     return _Damage(job, problems, damaged, light)
 

@@ -130,6 +130,7 @@ class PhotonTimes:
         arrived = (self.kind & RELEASED == 0) & (frame >= start) & (frame < last)
         times = self.times[arrived]
         frame = frame[arrived]
+        # A time at the end of the exposure rounds to `planes`, which is one too many.
         part = np.clip((times - frame / self.frame_rate) / self.exposure * planes, 0, planes - 1).astype(np.int64)
         plane = (frame - start) * planes + part
         return self._histogram(plane, self._pixel()[arrived], (last - start) * planes) > 0
@@ -146,6 +147,7 @@ class PhotonTimes:
 
     def _frame(self, times: Array) -> Array:
         """Return the frame of every time [n]; the start of an exposure belongs to it."""
+        # Events at the very start of an exposure must not round into the one before.
         frame = np.floor(times * self.frame_rate + 1e-12).astype(np.int64)
         return np.clip(frame, 0, self.shape[0] - 1)
 

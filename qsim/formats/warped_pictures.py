@@ -115,10 +115,12 @@ def frame(parts: Sequence[Layer], size: tuple[int, int], time: float) -> tuple[A
     top = _seen(parts, points, time)[1]
     moved = points.copy()
     for i, layer in enumerate(parts):
+        # From the picture back to the layer, and from there to where its point is one frame later.
         step = layer.path.matrix(time + 1) @ np.linalg.inv(layer.path.matrix(time))
         own = top == i
         moved[:, own] = step[:2, :2] @ points[:, own] + step[:2, 2:]
     inside = (moved >= 0).all(0) & (moved[0] <= height - 1) & (moved[1] <= width - 1)
+    # A point is seen again where the same layer is uppermost at its new place.
     valid = inside & (_seen(parts, moved, time + 1)[1] == top)
     flow = (moved - points)[::-1].reshape(2, *size)
     return total / SAMPLES**2, flow.astype(np.float32), valid.reshape(size)
@@ -141,6 +143,7 @@ def _path(size: tuple[int, int], largest: float, radius: float, rng: np.random.G
     angle = rng.uniform(0, 2 * np.pi)
     frequency = rng.uniform(0.2, 0.6)
     side = rng.uniform(0, 2 * np.pi)
+    # So that the largest speed of the sway, amplitude times frequency, is its share.
     sway = shares[1] / frequency
     return Path2D(
         place=(float(rng.uniform(0, size[0])), float(rng.uniform(0, size[1]))),

@@ -186,6 +186,8 @@ class Source:
     @functools.cached_property
     def shards(self) -> list[Shard]:
         """The shards of the set."""
+        # Shards are planned before anything is written: sizes come from the largest clip, so
+        # parts that are made on different machines agree on what each shard holds.
         largest = max(self._bytes(clip) for _, clip in self.alike)
         step = min(MOST_CLIPS, max(1, int(self.wanted.shard_size * 1e6 // largest)))
         found = []

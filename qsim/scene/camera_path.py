@@ -265,9 +265,11 @@ def _pose(frame: dict[str, Any], scale: float) -> Array:
             f"{frame['where']}: transform_matrix is no rotation with a position; its axes must be orthonormal and "
             "right-handed, and its last row 0, 0, 0, 1"
         )
+    # The nearest rotation: files round their numbers, and products of poses would let the error grow.
     left, _, right = np.linalg.svd(turn)
     matrix[:3, :3] = left @ right
     matrix[:3, 3] *= scale
+    # Files have z up, and cameras that look along -z with y up; here a camera looks along z with y down.
     return UPRIGHT @ matrix @ FLIP
 
 
@@ -290,6 +292,8 @@ def _seen_from(found: dict[str, Any], where: str, like: Camera, pose: Array, siz
     focal, aspect = _focal(stated, width)
     shift = ((stated.get("cx", width / 2) - width / 2) / height, (stated.get("cy", height / 2) - height / 2) / height)
     falloff = () if like.lens is None else like.lens.falloff
+    # Files state the distance from lens to sensor. The thin lens 1 / f = 1 / distance + 1 / ahead
+    # gives the focal length that focuses there; a pinhole has no such difference.
     distance = focal * like.pixel_pitch
     ahead = like.focus
     try:
@@ -342,4 +346,5 @@ def _focal(stated: dict[str, Any], width: int) -> tuple[float, float]:
         allowed = SQUARE_BY_ANGLE
     else:
         return across, 1.0
+    # Calibrations never find two equal lengths; those that agree this well are of square pixels.
     return (across, 1.0) if abs(down / across - 1) <= allowed else (down, across / down)

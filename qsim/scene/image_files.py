@@ -123,6 +123,7 @@ def _read_radiance(path: Path) -> Array:
             at = _read_old_row(body, at, rgbe[y]) if old else _read_row(body, at, rgbe[y])
     except (IndexError, ValueError) as error:
         raise ValueError(f"environment {path}: damaged at byte {len(content) - len(body) + at}") from error
+    # The exponent is stored with 128 added, and mantissas are in 1/256: 136 = 128 + 8.
     scale = np.ldexp(1.0, rgbe[..., 3].astype(np.int32) - 136)
     return (rgbe[..., :3] * np.where(rgbe[..., 3:] > 0, scale[..., None] / exposure, 0)).astype(np.float32)
 
@@ -180,6 +181,7 @@ def _read_row(body: bytes, at: int, row: Array) -> int:
     for channel in range(4):
         x = 0
         while x < width:
+            # Above 128 one byte is repeated count - 128 times; up to 128 as many bytes follow as they are.
             count = body[at]
             if count > 128:
                 row[x : x + count - 128, channel] = body[at + 1]

@@ -124,8 +124,10 @@ def _from_events(clip: Clip, stream: EventStream, instants: Sequence[int]) -> It
     """Yield photons per clip frame, float64 [H, W], at rising frames: the first frame and all contrast since."""
     camera = stream.camera
     height, width = clip.shape[1:]
+    # e-/s of photocurrent per photon of a clip frame.
     per_photon = stream.info.light.factor * camera.quantum_efficiency / clip.exposure
     first = np.log(clip_photons(clip, 0) * per_photon + camera.dark_current).ravel()
+    # Each event says that log current has changed by a threshold since the last one of its pixel.
     steps = np.array([-camera.threshold_off, camera.threshold_on])  # by polarity
     contrast = np.zeros(height * width)
     seen = 0.0

@@ -302,6 +302,7 @@ def in_memory(codes: Codes) -> Codes:
 def content_of(comparison: Comparison, clips: Sequence[Clip]) -> dict[str, object]:
     """Return the SHA-256 of the scored content: the descriptions of clips and stored stream, and the sensor files."""
     name = comparison.stream
+    # Descriptions hold the checksums of all files, so that their digest stands for the whole content.
     described = [
         [records.plain(clip.info), None if name is None else records.plain(clip.stream(name).info)] for clip in clips
     ]

@@ -115,6 +115,7 @@ def measure(
             continue
         cell = measure_cell(network, methods, settings, light)
         with _one_at_a_time(weights):
+            # Read again under the lock: another process may have added cells since.
             old = stored(weights, shared)
             annotate(weights, {KEY: Domain(merged(old.cells, [cell]), old.measured).to_json()})
     if progress is not None:

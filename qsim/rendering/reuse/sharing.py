@@ -103,6 +103,7 @@ def shared_samples(
     clip = need.frames * pixels * alone.cost(pixels)
     trials: list[Trial] = []
     for samples in COUNTS[:MOST_TRIED]:
+        # The most that sharing could save: as if so few samples and one neighbour were enough.
         saved = clip - need.frames * pixels * Sharing(samples, 1, kinds[0]).cost(pixels)
         cost = _trial_cost(samples, pilot, kinds)
         if saved <= cost or not most_neighbours(samples, pixels) or (wanted is None and cost > MOST_TRIAL * clip):
@@ -162,6 +163,7 @@ def _fractions(
     """Return error and doubt over what is allowed, for a whole clip by those of its frame t."""
     raw = need.expected(samples)
     ends = math.sqrt(_fewer_at_ends(need.frames, t, neighbours))
+    # A trial that met far less noise than so many samples have was lucky, and its error is not believed.
     errors = raw if LUCK * noisy < raw.plain else Errors(ends * clamped, ends * plain)
     return need.allowed.fraction(errors) / need.share, doubt / need.allowed.target / math.sqrt(DOUBT)
 
@@ -186,6 +188,7 @@ def _cheapest(trials: list[Trial], alone: Sharing, pixels: int) -> Sharing:
     for neighbours, kind in trials[0].found if trials else ():
         made = [trial for trial in trials if (neighbours, kind) in trial.found]
         series = zip(*(trial.found[neighbours, kind] for trial in made), strict=True)
+        # Both have to be reached: the error itself, and a standard error small enough to state it.
         needed = max(needed_samples([trial.samples for trial in made], list(values), 1.0) for values in series)
         if needed > COUNTS[-1]:
             continue

@@ -165,6 +165,8 @@ class FloRNN(nn.Module):
         restored = []
         for i in range(1, images.shape[1]):
             flow = self.ringed(flows.forward[:, i - 1])
+            # The look-ahead state runs ahead of the output; what its warp moves out of the picture
+            # stays in the ring, to be brought back when the output state gets there.
             canvas = average_splat(self.ringed(ahead), flow).to(ahead.dtype)
             kept.appendleft((canvas, flow))
             ahead = self.backward_rnn(images[:, i], maps[:, i], centre(canvas, ahead.shape[-2:]))
@@ -250,6 +252,7 @@ def centre(canvas: Tensor, size: torch.Size) -> Tensor:
 
 def warp_inside(image: Tensor, flow: Tensor) -> Tensor:
     """Warp [B, c, H, W] backward along a flow [B, 2, H, W]; 0 where any part would come from outside."""
+    # A warped channel of ones is below 1 where bilinear sampling took a part from outside.
     moved = warp(torch.cat([image, torch.ones_like(image[:, :1])], dim=1), flow, "zeros")
     return (moved[:, :-1] * (moved[:, -1:] >= VALID)).to(image.dtype)
 

@@ -78,6 +78,7 @@ class Spk2ImgNet(nn.Module):
         width = config.width
         self.frames_in = 2 * (GROUPS - 1) + config.group_frames
         self.look_ahead = self.frames_in - BEFORE - 1  # frames
+        # The published network gives 0.6 for a target of 1; its port forgot to divide by that.
         self.unit = 1.0 if config.as_published or config.group_frames == 3 else CONVERTER
         self.extractor = Extractor(config)
         self.mask0, self.mask1, self.mask3, self.mask4 = (Gate(width) for _ in range(GROUPS - 1))
@@ -128,6 +129,7 @@ class Spk2ImgNet(nn.Module):
                 parts.append(middle[0])
                 continue
             aligned = self.pcd_align(pyramid, middle)
+            # Alignment errs where bodies hide each other; there the gate closes.
             parts.append(gate(aligned, middle[0]) * aligned)
         x = F.relu(self.rec_conv0(torch.cat(parts, dim=1)))
         return self.rec_conv2(F.relu(self.rec_conv1(x)))
