@@ -34,7 +34,7 @@ LIMITS = f"""Every network saw the same number of windows, with as many frames a
 more time for them: the table of [equal time](equal_budget.md) asks the other question. This is still a short training,
 so the order can change with a longer one. Windows have 80 x 80 px, those of RVRT 128 x 128 px, because it fills smaller
 ones to 132 px. Frames: those of which one is restored, and how many of them lie ahead.
-memdeblur has no scores: its weights could not be read on the machine that trained them, a defect that is mended.
+memdeblur has no scores: its weights could not be read on the machine that trained them.
 Networks below {FLOOR} have no rank."""
 
 
