@@ -33,9 +33,11 @@ LEAST = 1e-9  # of phi between two points of the table: phi stays invertible whe
 FLOOR = 1e-3  # of the variance of a code [codes^2], below which the deviation is taken as that of an efficient mean
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class InformationDomain:
-    """Tables of one sensor over light, from darkness to the end of its rise."""
+    """Tables of one sensor over light, from darkness to the end of its rise. Equal only to itself, so that what is made
+    from it can be kept by it.
+    """
 
     photons: Array  # [G], rising from 0
     mean_code: Array  # [G], rising
@@ -43,11 +45,16 @@ class InformationDomain:
     deviation: Array  # [G], of phi from one code; divided by sqrt(n) for the mean of n codes
     variance: Array  # [G], of a code [codes^2]
     slope: Array  # [G], photons per unit of phi: the deviation of the light that one code tells
+    top: int  # the largest code
+
+    @property
+    def dark_slope(self) -> float:
+        """Return the slope of phi over the mean code below that of a dark pixel."""
+        return float(self.deviation[0] / np.sqrt(max(self.variance[0], FLOOR)))
 
     def forward(self, mean_code: Array) -> Array:
         """Return phi, float32 [...], of mean codes [...]; negative below that of a dark pixel."""
-        slope = self.deviation[0] / np.sqrt(max(self.variance[0], FLOOR))  # of phi over the mean code of a dark pixel
-        below = slope * np.minimum(mean_code - self.mean_code[0], 0)
+        below = self.dark_slope * np.minimum(mean_code - self.mean_code[0], 0)
         return (np.interp(mean_code, self.mean_code, self.phi) + below).astype(np.float32)
 
     def noise(self, mean_code: Array) -> Array:
@@ -87,6 +94,7 @@ def information_domain(sensor: Sensor, exposure: float) -> InformationDomain:
         deviation=_at_points(deviation),
         variance=table.variance,
         slope=_at_points(np.diff(table.photons) / steps),
+        top=table.top,
     )
 
 
