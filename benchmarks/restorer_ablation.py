@@ -194,7 +194,7 @@ def draw(kind: str, split: str, args: argparse.Namespace, size: Size, folder: Pa
 
 def still(pyramid: Any, offsets: Any, codes: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
     """Return paths of no motion: `quiver.baselines.paths.motion_paths.paths` otherwise."""
-    nothing = torch.zeros(2, *(2 * side for side in codes.shape[1:]))
+    nothing = torch.zeros(len(codes), 2, *(2 * side for side in codes.shape[2:]))
     return nothing, nothing
 
 

@@ -59,6 +59,7 @@ class DomainTables:
         """Return phi and its deviation, float32 [B, H, W], of the mean of `count` codes; half a count below saturation
         at most.
         """
+        # At saturation a mean code tells no light; half a count below, the estimate is that of the moment inverse.
         most = torch.maximum(self.last - 0.5 / count, self.first)
         mean_code = torch.minimum(mean_code, most)
         place = self.code.place(mean_code)

@@ -11,6 +11,9 @@ of a stream need no invented frames.
 
 The count of a pixel is (sum of weights)^2 / sum of squared weights: the codes that, averaged alike, have its noise.
 
+A batch of windows is merged at once, on any device; nothing waits for the host. Frames of a group share their weight,
+so sums of a group's frames are all that is kept of them.
+
 Ours; against QBP (qbp.py) one path per place replaces pairs of frames that are matched alone, and weights per pixel
 replace those per patch and frequency.
 """
@@ -28,143 +31,185 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from qsim.sensor.sensor import Sensor
-from quiver.baselines.information_domain import FLOOR, InformationDomain, information_domain
+from quiver.baselines.domain_tables import DomainTables, domain_tables
+from quiver.baselines.information_domain import InformationDomain, information_domain
 from quiver.baselines.paths.motion_paths import paths
-from quiver.baselines.paths.moved_frames import SCALES, box_mean, displacement, enlarged, look
+from quiver.baselines.paths.moved_frames import CHUNK, SCALES, Path, box_mean, enlarged, halved, look
 from quiver.baselines.sliding_window import check_window, checked_codes, in_units, look_ahead
+from quiver.device import is_gpu
 
 # (cells of 2 x 2 px beside the own one whose mean difference is squared, and over which squares are averaged; statistic
 # up to which frames agree; excess over it at which a frame has half its weight)
 STATISTICS = ((1, 1, 3.0, 1.0), (0, 2, 1.6, 0.25))
 GROUPS = ((-1,), (1,), (-2, -3), (2, 3), (-4, -5), (4, 5))  # offsets of the frames that `Merged.groups` averages
+NEAR = 2  # groups of one frame beside the reference; the other frames are compared with the mean of these three
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Merged:
-    """Mean codes and counts of one frame, float32 [H, W] each."""
+    """Mean codes and counts of one frame of each window, float32 [B, H, W] each."""
 
-    mean_code: Array
-    count: Array
-    alone: Array  # codes of the frame
-    near: Array  # mean code of the frame and its two neighbours, moved and weighted
-    near_count: Array
-    still: Array  # mean code of the window without motion
+    mean_code: Tensor
+    count: Tensor
+    alone: Tensor  # codes of the frame
+    near: Tensor  # mean code of the frame and its two neighbours, moved and weighted
+    near_count: Tensor
+    still: Tensor  # mean code of the window without motion
     frames: int  # in the window
-    groups: Array  # [6, H, W], mean codes of GROUPS, moved and not weighted
-    group_counts: Array  # [6, H, W], frames of each that lie in the picture
+    groups: Tensor  # [B, 6, H, W], mean codes of GROUPS, moved and not weighted
+    group_counts: Tensor  # [B, 6, H, W], frames of each that lie in the picture
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Prepared:
-    """One frame: its codes [H, W], and phi of pooled codes at every scale; sides are multiples of the largest."""
+    """Frames: their codes [..., H, W], and phi of pooled codes at every scale; sides are multiples of the largest."""
 
     codes: Tensor
     pyramid: dict[int, Tensor]
-    size: tuple[int, int]  # of the frame before it was filled
+    size: tuple[int, int]  # of a frame before it was filled
 
 
-def prepared(codes: Array, domain: InformationDomain) -> Prepared:
-    """Return a frame of codes [H, W] with its pyramid; bottom and right repeat the last pixels."""
-    height, width = codes.shape
+def prepared(codes: Tensor, tables: DomainTables) -> Prepared:
+    """Return windows of codes [B, K, H, W] with their pyramids; bottom and right repeat the last pixels."""
+    height, width = codes.shape[-2:]
     fill = (0, -width % SCALES[0], 0, -height % SCALES[0])
-    frame = functional.pad(torch.from_numpy(codes.astype(np.float32))[None, None], fill, mode="replicate")
-    pooled = {scale: functional.avg_pool2d(frame, scale)[0, 0] for scale in SCALES}
-    pyramid = {scale: torch.from_numpy(domain.forward(image.numpy())) for scale, image in pooled.items()}
-    return Prepared(frame[0, 0], pyramid, (height, width))
+    frames = codes.to(torch.float32)
+    frames = functional.pad(frames, fill, mode="replicate") if any(fill) else frames
+    pooled = {SCALES[-1]: halved(frames)}
+    for finer, scale in zip(SCALES[:0:-1], SCALES[-2::-1], strict=True):
+        pooled[scale] = halved(pooled[finer])  # sums of whole numbers: exact
+    pyramid = {}
+    for scale, image in pooled.items():
+        flat = image.flatten(1, 2)  # [B, K * h, w]
+        pyramid[scale] = tables.phi_of_pooled(flat, scale).view(image.shape)
+    return Prepared(frames, pyramid, (height, width))
 
 
-def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: InformationDomain) -> Merged:
-    """Return the merged reference frame of a window of frames; `offsets` are their places in time, with 0."""
-    with torch.no_grad():
-        pyramid = {scale: torch.stack([frame.pyramid[scale] for frame in window]) for scale in SCALES}
-        codes = torch.stack([functional.avg_pool2d(frame.codes[None], SCALES[-1])[0] for frame in window])
-        # The noise that the search for paths expects, from the window without motion: only its size matters there.
-        deviation = variance_of(box_mean(codes.mean(0)[None], 2)[0], domain).sqrt()
-        velocity, acceleration = paths(pyramid, offsets, codes, deviation)
-        moved = torch.empty(len(window), *window[0].codes.shape)
-        inside = torch.ones_like(moved)
-        for i, (frame, offset) in enumerate(zip(window, offsets, strict=True)):
-            if offset:
-                moved[i], inside[i] = look(frame.codes, displacement(velocity, acceleration, offset), frame.size)
-            else:
-                moved[i] = frame.codes
-        weight = weights(moved, inside, offsets, domain)
-        near = [i for i, offset in enumerate(offsets) if abs(offset) <= 1]
-        still = sum((frame.codes for frame in window[1:]), window[0].codes) / len(window)
-        alone = window[offsets.index(0)].codes.numpy()
-        groups = [[i for i, offset in enumerate(offsets) if offset in group] for group in GROUPS]
-        counts = torch.stack([inside[group].sum(0) for group in groups])
-        sums = torch.stack([(moved[group] * inside[group]).sum(0) for group in groups])
-        return Merged(
-            *_weighted(moved, weight),
-            alone,
-            *_weighted(moved[near], weight[near]),
-            still.numpy(),
-            frames=len(window),
-            groups=(sums / counts.clamp(min=1)).numpy(),
-            group_counts=counts.numpy(),
-        )
+def window_of(frames: Sequence[Prepared]) -> Prepared:
+    """Return one window of frames that were prepared one by one, [1, 1, H, W] each."""
+    pyramid = {scale: torch.cat([frame.pyramid[scale] for frame in frames], dim=1) for scale in SCALES}
+    return Prepared(torch.cat([frame.codes for frame in frames], dim=1), pyramid, frames[0].size)
 
 
-def variance_of(mean_code: Tensor, domain: InformationDomain) -> Tensor:
-    """Return the variance of a code [...] at mean codes [...], FLOOR at least."""
-    variance = np.interp(mean_code.numpy(), domain.mean_code, domain.variance)
-    return torch.from_numpy(np.maximum(variance, FLOOR).astype(np.float32))
+@torch.no_grad()
+def merge(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Merged:
+    """Return the merged reference frames of windows [B, K, H, W]; `offsets` are the frames' places in time, with 0."""
+    codes = window.codes
+    pooled = halved(codes)
+    # The noise that the search for paths expects, from the window without motion: only its size matters there.
+    deviation = tables.variance(box_mean(pooled.mean(1), 2)).sqrt()
+    path = paths(window.pyramid, offsets, pooled, deviation)
+    alone = codes[:, offsets.index(0)]
+    sums, counts, beside = _group_sums(codes, path, offsets, window.size)
+    weights, means, near_total, near_mean = group_weights(alone, sums, counts, beside, tables)
+    total, mean_code = _weighted(alone, weights, sums, counts)
+    return Merged(
+        mean_code,
+        _count(total, weights, counts),
+        alone,
+        near_mean,
+        _count(near_total, weights[:, :NEAR], counts[:, :NEAR]),
+        codes.sum(1).div_(len(offsets)),
+        frames=len(offsets),
+        groups=means[:, : len(GROUPS)],
+        group_counts=counts[:, : len(GROUPS)],
+    )
 
 
-def _weighted(moved: Tensor, weight: Tensor) -> tuple[Array, Array]:
-    """Return the weighted mean [H, W] of frames, and the number of equal weights with the same noise."""
-    total = weight.sum(0)
-    return ((moved * weight).sum(0) / total).numpy(), (total.square() / weight.square().sum(0)).numpy()
+def groups_of(offsets: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+    """Return the offsets that share a weight: those of GROUPS, and pairs of farther frames, of a longer window."""
+    last = max(abs(offset) for offset in offsets) // 2
+    return GROUPS + tuple((2 * side * n, side * (2 * n + 1)) for n in range(3, last + 1) for side in (-1, 1))
 
 
-def weights(moved: Tensor, inside: Tensor, offsets: Sequence[int], domain: InformationDomain) -> Tensor:
-    """Return weights [K, H, W] of moved codes [K, H, W], 0 where not `inside`; the reference has the weight 1."""
-    centre = offsets.index(0)
+def _group_sums(
+    codes: Tensor, path: Path, offsets: Sequence[int], size: tuple[int, int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return sums of the moved frames of each group where they lie in the picture, [B, G, H, W], how many do, and the
+    frames beside the reference wherever they lie, [B, 2, H, W]: 0 where there is none.
+    """
+    batch, _, height, width = codes.shape
+    groups = groups_of(offsets)
+    sums = codes.new_zeros(batch, len(groups), height, width)
+    counts = torch.zeros_like(sums)
+    beside = codes.new_zeros(batch, NEAR, height, width)
+    place = {offset: g for g, group in enumerate(groups) for offset in group}
+    moving = [i for i, offset in enumerate(offsets) if offset]
+    step = len(offsets) if is_gpu(codes.device) else max(1, CHUNK // (batch * height * width))
+    for first in range(0, len(moving), step):
+        chosen = moving[first : first + step]
+        frames = torch.stack([codes[:, i] for i in chosen], dim=1)
+        seen, inside = look(frames, path, [offsets[i] for i in chosen], 1, size)
+        for n, i in enumerate(chosen):
+            g = place[offsets[i]]
+            counts[:, g] += inside[:, n]
+            if g < NEAR:
+                beside[:, g] = seen[:, n]
+            sums[:, g].addcmul_(seen[:, n], inside[:, n])
+    return sums, counts, beside
+
+
+def group_weights(
+    alone: Tensor, sums: Tensor, counts: Tensor, beside: Tensor, tables: DomainTables
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the weights of groups [B, G, H, W], of which a frame has its own where it lies in the picture; the mean
+    codes of groups; and the sum of weights and the mean code [B, H, W] of the nearest three frames.
+
+    The reference frame `alone` has the weight 1. The others are those of `_group_sums`.
+    """
     # One picture of the variance serves all frames, or frames that happen to be dim would be trusted more.
-    half = functional.avg_pool2d((moved * inside).sum(0)[None] / inside.sum(0)[None], 2)
-    variance = variance_of(box_mean(half, 1)[0], domain)
-    weight = torch.zeros_like(moved)
-    weight[centre] = 1.0
-    for i, offset in enumerate(offsets):
-        if abs(offset) == 1:
-            weight[i] = agreement(moved[i] - moved[centre], 2 * variance) * inside[i]
-    near = [i for i, offset in enumerate(offsets) if abs(offset) <= 1]
-    total = weight[near].sum(0)
+    mean = (sums.sum(1) + alone) / (counts.sum(1) + 1)
+    variance = tables.variance(box_mean(halved(mean), 1))[:, None]
+    near = agreement(beside - alone[:, None], 2 * variance)
     # Far frames are compared with the mean of the nearest three, which has less noise than the reference alone.
-    base = (weight[near] * moved[near]).sum(0) / total
-    base_share = functional.avg_pool2d((1 / total)[None], 2)[0]
-    for side in (-1, 1):
-        for pair in range(1, max(abs(offset) for offset in offsets) // 2 + 1):
-            group = [i for i, offset in enumerate(offsets) if offset * side > 0 and abs(offset) // 2 == pair]
-            if not group:
-                continue
-            count = inside[group].sum(0).clamp_(min=1)
-            mean = (moved[group] * inside[group]).sum(0) / count
-            share = functional.avg_pool2d((1 / count)[None], 2)[0]
-            weight[group] = agreement(mean - base, (share + base_share) * variance) * inside[group]
-    return weight
+    total, base = _weighted(alone, near, sums[:, :NEAR], counts[:, :NEAR])
+    most = counts.clamp(min=1)
+    means = sums / most
+    share = halved(most[:, NEAR:].reciprocal()).add_(halved(total.reciprocal())[:, None])
+    far = agreement(means[:, NEAR:] - base[:, None], share.mul_(variance))
+    return torch.cat([near, far], dim=1), means, total, base
+
+
+def _weighted(alone: Tensor, weights: Tensor, sums: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the sum of the weights of all frames, 1 of the reference included, and their mean code [B, H, W]."""
+    total = (weights * counts).sum(1).add_(1)
+    return total, (weights * sums).sum(1).add_(alone).div_(total)
+
+
+def _count(total: Tensor, weights: Tensor, counts: Tensor) -> Tensor:
+    """Return the number of equal weights with the same noise, [B, H, W]."""
+    return total.square().div_((weights.square() * counts).sum(1).add_(1))
 
 
 def agreement(difference: Tensor, variance: Tensor) -> Tensor:
-    """Return weights [H, W] from a difference of moved codes [H, W] and its variance per pixel [H/2, W/2]."""
-    cells = functional.avg_pool2d(difference[None], 2)
-    excess = torch.zeros_like(variance)
+    """Return weights [B, G, H, W] from differences of moved codes and their variance per pixel [B, G, H/2, W/2]."""
+    cells = halved(difference)
+    excess: Tensor | None = None
     for beside, around, tolerance, softness in STATISTICS:
         # The mean of n pixels has the variance of one over n: its square times n over that is 1 where nothing changed.
         pixels = 4 * (2 * beside + 1) ** 2
-        statistic = box_mean(box_mean(cells, beside).square() * (pixels / variance), around)[0]
-        excess = torch.maximum(excess, (statistic - tolerance) / softness)
-    return enlarged((1 / (1 + excess))[None], difference.shape)[0]
+        mean = box_mean(cells, beside) if beside else cells
+        statistic = box_mean(mean.square() * (pixels / variance), around)
+        part = statistic.sub_(tolerance).div_(softness)
+        excess = part.clamp_(min=0) if excess is None else torch.maximum(excess, part)
+    assert excess is not None
+    return enlarged(excess.add_(1).reciprocal_(), difference.shape[-2:])
 
 
 def stream(
-    read: Callable[[int], Array], length: int, domain: InformationDomain, window: int, frames: range
+    read: Callable[[int], Array],
+    length: int,
+    domain: InformationDomain,
+    window: int,
+    frames: range,
+    device: torch.device | str = "cpu",
 ) -> Iterator[Merged]:
-    """Yield merged frames of a stream of `length` frames, each after look_ahead(window) more frames were read.
+    """Yield merged frames [1, H, W] of a stream of `length` frames, each after look_ahead(window) more were read.
 
     `read` returns the codes [H, W] of one frame. A frame is read and pooled once; windows end where the stream ends.
     """
+    device = torch.device(device)
+    tables = domain_tables(domain, device)
     kept: deque[tuple[int, Prepared]] = deque()
     for t in frames:
         first = max(0, t - window // 2)
@@ -172,8 +217,14 @@ def stream(
         while kept and kept[0][0] < first:
             kept.popleft()
         for i in range(kept[-1][0] + 1 if kept else first, last + 1):
-            kept.append((i, prepared(read(i), domain)))
-        yield merge([frame for _, frame in kept], [i - t for i, _ in kept], domain)
+            kept.append((i, prepared(as_codes(read(i)[None, None], device), tables)))
+        yield merge(window_of([frame for _, frame in kept]), [i - t for i, _ in kept], tables)
+
+
+def as_codes(codes: Array, device: torch.device) -> Tensor:
+    """Return codes of NumPy on a device, in few bytes until they are there."""
+    small = codes if codes.dtype == np.uint8 else codes.astype(np.float32)
+    return torch.from_numpy(np.ascontiguousarray(small)).to(device, non_blocking=True)
 
 
 def restore(
@@ -197,5 +248,5 @@ def restore(
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     height, width = codes.shape[1:]
     for i, merged in enumerate(stream(lambda t: codes[t], len(codes), domain, window, frames)):
-        restored[i] = table.invert(merged.mean_code[:height, :width], merged.frames)
+        restored[i] = table.invert(merged.mean_code[0, :height, :width].numpy(), merged.frames)
     return in_units(restored, photons_per_unit)

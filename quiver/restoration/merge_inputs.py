@@ -1,21 +1,21 @@
 """Prepares the inputs of MergeNet: merged frames on the scale phi, in units of their noise, with maps of what is known.
 
-    Merged (path_merge.py) -> phi (information_domain.py) -> channels [13, H, W] -> MergeNet -> phi again -> photons
+    Merged (path_merge.py) -> phi (information_domain.py) -> channels [B, 13, H, W] -> MergeNet -> phi again -> photons
 
-All channels describe a pixel and its near surroundings; none depends on the size of the frame.
+All channels describe a pixel and its near surroundings; none depends on the size of the frame. They are made where the
+merged frames are, for a batch of windows at once.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy import ndarray as Array
 from torch import Tensor
 
-from quiver.baselines.information_domain import FLOOR, InformationDomain, information_domain
-from quiver.baselines.path_merge import Merged, stream
+from quiver.baselines.domain_tables import DomainTables, domain_tables
+from quiver.baselines.information_domain import InformationDomain, information_domain
+from quiver.baselines.path_merge import Merged, as_codes, merge, prepared
 from quiver.baselines.paths.moved_frames import box_mean
 from quiver.data.codes import Codes
 
@@ -26,28 +26,36 @@ MOST = 4.0  # of a channel of a group: a frame of another scene tells no more
 LEAST_LIGHT = 1e-3  # photons, added to light before it is compared with its noise
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MergeInputs:
-    """Inputs of one frame, float32."""
+    """Inputs of one frame of each window, float32."""
 
-    channels: Tensor  # [13, H, W]
-    phi: Tensor  # [H, W], of the merged mean code
-    deviation: Tensor  # [H, W], of the noise of phi
+    channels: Tensor  # [B, 13, H, W]
+    phi: Tensor  # [B, H, W], of the merged mean code
+    deviation: Tensor  # [B, H, W], of the noise of phi
+
+    def cut(self, height: int, width: int) -> MergeInputs:
+        """Return the first rows and columns."""
+        return MergeInputs(*(x[..., :height, :width] for x in (self.channels, self.phi, self.deviation)))
 
 
 def middle_inputs(codes: Codes) -> tuple[MergeInputs, InformationDomain]:
     """Return the inputs of the middle frame of a window of codes, cut to its size, and the tables of its sensor."""
     domain = information_domain(codes.sensor, codes.exposure)
-    length, height, width = codes.shape
-    window = codes.read(0, length)
-    middle = length // 2
-    found = merge_inputs(next(stream(lambda t: window[t], length, domain, length, range(middle, middle + 1))), domain)
-    cut = MergeInputs(*(x[..., :height, :width] for x in (found.channels, found.phi, found.deviation)))
-    return cut, domain
+    window = as_codes(codes.read(0, codes.shape[0])[None], torch.device("cpu"))
+    return inputs_of_windows(window, domain_tables(domain, window.device)), domain
 
 
-def merge_inputs(merged: Merged, domain: InformationDomain) -> MergeInputs:
-    """Return the inputs of a merged frame [H, W].
+def inputs_of_windows(codes: Tensor, tables: DomainTables) -> MergeInputs:
+    """Return the inputs of the middle frames of windows of codes [B, K, H, W], where the codes are."""
+    frames, height, width = codes.shape[1:]
+    offsets = range(-(frames // 2), frames - frames // 2)
+    return merge_inputs(merge(prepared(codes, tables), offsets, tables), tables).cut(height, width)
+
+
+@torch.no_grad()
+def merge_inputs(merged: Merged, tables: DomainTables) -> MergeInputs:
+    """Return the inputs of merged frames [B, H, W].
 
     Channels: the merged phi over its local level; the frame alone, the nearest three, the unmoved window and the level
     around the pixel over the merged phi, each in units of its noise; the deviation of the noise; the logarithm of the
@@ -55,43 +63,29 @@ def merge_inputs(merged: Merged, domain: InformationDomain) -> MergeInputs:
     in units of their noise, which tell what merging left out. Levels are phi of pooled codes: phi of single pixels
     loses light near saturation.
     """
-    phi, deviation = _stabilised(merged.mean_code, merged.count, domain)
-    alone, alone_deviation = _stabilised(merged.alone, np.ones_like(merged.alone), domain)
-    near, near_deviation = _stabilised(merged.near, merged.near_count, domain)
-    still, still_deviation = _stabilised(merged.still, np.full_like(merged.still, merged.frames), domain)
-    mean_code = torch.from_numpy(merged.mean_code)[None]
-    around = box_mean(mean_code, NEARBY)[0].numpy()
-    local = domain.forward(box_mean(mean_code, LOCAL)[0].numpy())
-    light = np.interp(local, domain.phi, domain.photons)
-    blurred = np.interp(local, domain.phi, domain.slope) * deviation
+    phi, deviation = tables.stabilised(merged.mean_code, merged.count)
+    channels = phi.new_empty(len(phi), 7 + merged.groups.shape[1], *phi.shape[1:])
+    local = tables.phi(box_mean(merged.mean_code, LOCAL))
+    own = (deviation * UNIT).reciprocal_()
+    torch.mul(phi - local, own, out=channels[:, 0])
+    counts: tuple[Tensor | float, ...] = (1.0, merged.near_count, float(merged.frames))
+    others = zip((merged.alone, merged.near, merged.still), counts, strict=True)
+    for i, (mean_code, count) in enumerate(others, 1):
+        other, noise = tables.stabilised(mean_code, count)
+        torch.div(other.sub_(phi), noise.mul_(UNIT), out=channels[:, i])
+    around = box_mean(merged.mean_code, NEARBY)
+    torch.mul(tables.phi(around).sub_(phi), own, out=channels[:, 4])
+    channels[:, 5] = deviation
+    light, slope = tables.light_and_slope(local)
     # Light over its noise, in octaves: it tells the network where codes are dark or saturated.
-    known = np.log2((light + LEAST_LIGHT) / (blurred + LEAST_LIGHT)).clip(-4, 8) / UNIT
-    channels = [
-        (phi - local) / (UNIT * deviation),
-        (alone - phi) / (UNIT * alone_deviation),
-        (near - phi) / (UNIT * near_deviation),
-        (still - phi) / (UNIT * still_deviation),
-        (domain.forward(around) - phi) / (UNIT * deviation),
-        deviation,
-        known,
-        *_groups(merged, around, domain),
-    ]
-    stacked = np.stack(channels, dtype=np.float32, casting="same_kind")
-    return MergeInputs(torch.from_numpy(stacked), torch.from_numpy(phi), torch.from_numpy(deviation))
+    known = light.add_(LEAST_LIGHT).div_(slope.mul_(deviation).add_(LEAST_LIGHT)).log2_().clamp_(-4, 8)
+    torch.div(known, UNIT, out=channels[:, 6])
+    _groups(merged, around, tables, out=channels[:, 7:])
+    return MergeInputs(channels, phi, deviation)
 
 
-def _groups(merged: Merged, around: Array, domain: InformationDomain) -> Array:
-    """Return groups over the merged frame [6, H, W], in units of their noise at the level around; 0 without a frame."""
-    variance = np.maximum(np.interp(around, domain.mean_code, domain.variance), FLOOR)
-    apart = (merged.groups - merged.mean_code) * np.sqrt(merged.group_counts / variance) / UNIT
-    found: Array = apart.clip(-MOST, MOST)
-    return found
-
-
-def _stabilised(mean_code: Array, count: Array, domain: InformationDomain) -> tuple[Array, Array]:
-    """Return phi and its deviation, float32 [H, W], of the mean of `count` codes; half a count below saturation."""
-    # At saturation a mean code tells no light; half a count below, the estimate is that of the moment inverse.
-    most = np.maximum(domain.mean_code[-1] - 0.5 / count, domain.mean_code[0])
-    mean_code = np.minimum(mean_code, most)
-    deviation = domain.noise(mean_code) / np.sqrt(count)
-    return domain.forward(mean_code), deviation.astype(np.float32)
+def _groups(merged: Merged, around: Tensor, tables: DomainTables, out: Tensor) -> None:
+    """Write groups over the merged frame [B, 6, H, W], in units of noise at the level around; 0 without a frame."""
+    torch.sub(merged.groups, merged.mean_code[:, None], out=out)
+    noise = tables.variance(around).rsqrt_().div_(UNIT)
+    out.mul_(merged.group_counts.sqrt()).mul_(noise[:, None]).clamp_(-MOST, MOST)

@@ -26,13 +26,16 @@ def fill_merged(
 
     Where a cut changes the answer (pieces.py), the line returned states by how much neighbouring tiles differ.
     """
+    from quiver.baselines.domain_tables import domain_tables
     from quiver.baselines.information_domain import information_domain
     from quiver.baselines.path_merge import stream
     from quiver.model.blocks import WINDOW
 
     length, height, width = codes.shape
+    device = next(network.parameters()).device
     domain = information_domain(codes.sensor, codes.exposure)
-    pieces = cut_pieces(network, height, width, options.bound(host=True))  # merging runs on the CPU
+    tables = domain_tables(domain, device)
+    pieces = cut_pieces(network, height, width, options.bound())
     apart = Disagreement.nothing(height, width)
     done = 0
     read = frame_reader(codes)
@@ -43,8 +46,8 @@ def fill_merged(
         def frame(t: int, part: tuple[slice, slice] = part) -> Array:
             return read(t)[part]
 
-        for t, merged in enumerate(stream(frame, length, domain, WINDOW, range(first, first + len(out)))):
-            restored = corrected(network, merged, domain, options)[:rows, :columns]
+        for t, merged in enumerate(stream(frame, length, domain, WINDOW, range(first, first + len(out)), device)):
+            restored = corrected(network, merged, tables, options)[:rows, :columns]
             out[(t, *part)] += tile.weight * restored
             # One frame tells how much tiles differ, as all have the same cut.
             if t == 0 and not pieces.exact:
@@ -55,16 +58,16 @@ def fill_merged(
     return told_of_cut(codes, pieces, apart)
 
 
-def corrected(network: Any, merged: Any, domain: Any, options: RestoreOptions) -> Array:
-    """Return photons, float32 [H, W], of a merged frame after the network's correction."""
+def corrected(network: Any, merged: Any, tables: Any, options: RestoreOptions) -> Array:
+    """Return photons, float32 [H, W], of a merged frame [1, H, W] after the network's correction."""
     import torch
 
     from quiver.restoration.merge_inputs import merge_inputs
 
-    inputs = merge_inputs(merged, domain)
-    device = next(network.parameters()).device
+    inputs = merge_inputs(merged, tables)
+    device = inputs.phi.device
     low = options.precision == "bfloat16"
     with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=low):
-        correction = network(inputs.channels[None].to(device))[0, 0].float().cpu()
-    restored: Array = domain.inverse((inputs.phi + inputs.deviation * correction).numpy())
+        correction = network(inputs.channels)[:, 0].float()
+    restored: Array = tables.photons(correction * inputs.deviation + inputs.phi)[0].cpu().numpy()
     return restored

@@ -51,9 +51,9 @@ def prepare(codes: Codes) -> dict[str, Tensor]:
     top = float(domain.phi[-1])
     table = np.interp(np.linspace(0, top, NODES), domain.phi, domain.photons) / codes.white
     return {
-        "channels": inputs.channels,
-        "phi": inputs.phi,
-        "deviation": inputs.deviation,
+        "channels": inputs.channels[0],
+        "phi": inputs.phi[0],
+        "deviation": inputs.deviation[0],
         "top": torch.tensor(top, dtype=torch.float32),
         "table": torch.from_numpy(table.astype(np.float32)),
     }

@@ -1,6 +1,6 @@
 """Estimates how every place of a frame moves through a window of noisy frames: one smooth path per place.
 
-    frames [K, H, W] at scales 8, 4, 2 (phi of pooled codes) ->
+    frames [B, K, H, W] at scales 8, 4, 2 (phi of pooled codes) ->
     fast paths: scale 8, every velocity up to SPEED is tried, all frames vote -> scale 4, those of neighbours are tried
     slow paths: scale 4, every velocity up to SLOW is tried
     both: Gauss-Newton of velocity v and acceleration a at scale 4, all frames at once -> the better one at scale 2 ->
@@ -13,12 +13,15 @@ Costs are sums over blocks and the corrections of flat places follow their neigh
 Frames that do not fit (occlusions, light that changes) lose their vote.
 
 Ours; the steps are block matching, and the registration of Lucas and Kanade (1981) to the mean of all moved frames.
-Fields are [2, H, W] = (down, right), in pixels of the full frame per frame, at cells of one scale.
+Fields are [B, 2, H, W] = (down, right), in pixels of the full frame per frame, at cells of one scale. All windows of a
+batch have the same offsets; nothing waits for the host.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as functional
@@ -28,10 +31,10 @@ from quiver.baselines.paths.moved_frames import (
     SCALES,
     Path,
     box_mean,
-    displacement,
     enlarged,
-    kept_noise,
     look,
+    look_still,
+    look_with_noise,
     smooth_mean,
 )
 from quiver.baselines.paths.path_search import misfit, misfits_of, neighbours, search
@@ -47,34 +50,38 @@ MISFIT = 3.0  # variances of the noise at which a frame has half a vote
 STIFFNESS = 50.0  # information of a block below which it follows its neighbours
 
 
-def paths(
-    pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, deviation: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return velocity and acceleration [2, H, W] of frames at each scale: {scale: [K, H/scale, W/scale]}.
+def paths(pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, deviation: Tensor) -> Path:
+    """Return velocity and acceleration [B, 2, H, W] of frames at each scale: {scale: [B, K, H/scale, W/scale]}.
 
     `offsets` are the frames' places in time; 0 is the reference. The noise of a frame at a scale has the deviation
-    1 / scale, as phi of pooled codes nearly has. Mean `codes` [K, H/2, W/2] of scale 2 and the `deviation` [H/2, W/2]
-    of one code tell what moves: of four codes of one bit, phi has up to 1.8 times that variance.
+    1 / scale, as phi of pooled codes nearly has. Mean `codes` [B, K, H/2, W/2] of scale 2 and the `deviation`
+    [B, H/2, W/2] of one code tell what moves: of four codes of one bit, phi has up to 1.8 times that variance.
     """
     coarse, middle, fine = (pyramid[scale] for scale in SCALES)
-    shape = middle.shape[1:]
+    shape = middle.shape[-2:]
     fast = neighbours(middle, offsets, enlarged(search(coarse, offsets, SCALES[0], SPEED), shape), SCALES[1])
     slow = enlarged(search(middle, offsets, SCALES[1], SLOW), shape)
-    found = [corrected(middle, offsets, (each, torch.zeros_like(each)), *REFINE[0]) for each in (fast, slow)]
+    start = torch.cat([fast, slow])
+    found = corrected(middle.repeat(2, 1, 1, 1), offsets, (start, torch.zeros_like(start)), *REFINE[0])
     velocity, acceleration = corrected(fine, offsets, _better(fine, offsets, found), *REFINE[1])
-    full = [SCALES[-1] * side for side in codes.shape[1:]]
+    full = [SCALES[-1] * side for side in codes.shape[-2:]]
     moves = moving(codes, deviation, offsets, velocity, acceleration)
-    moves = functional.interpolate(moves[None, None].to(velocity.dtype), size=full)[0]
+    moves = functional.interpolate(moves[:, None].to(velocity.dtype), size=full)
     return enlarged(velocity, full) * moves, enlarged(acceleration, full) * moves
 
 
-def _better(frames: Tensor, offsets: Sequence[int], found: Sequence[Path]) -> Path:
-    """Return the second path where it fits the frames [K, h, w] of scale 2 better by DETAIL, else the first one."""
+def _better(frames: Tensor, offsets: Sequence[int], found: Path) -> Path:
+    """Return the second path where it fits the frames [B, K, h, w] of scale 2 better by DETAIL, else the first one.
+
+    The paths [2 B, 2, ...] of all windows are followed by second ones of all windows.
+    """
     radius, margin = DETAIL
-    fast, slow = ((enlarged(v, frames.shape[1:]), enlarged(a, frames.shape[1:])) for v, a in found)
-    costs = [misfits_of(frames, offsets, path, SCALES[2], radius) for path in (fast, slow)]
-    chosen = costs[0] - costs[1] > margin
-    return torch.where(chosen, slow[0], fast[0]), torch.where(chosen, slow[1], fast[1])
+    height = frames.shape[-2]
+    both = [torch.cat(enlarged(field, frames.shape[-2:]).chunk(2), dim=2) for field in found]
+    costs = misfits_of(frames, offsets, (both[0], both[1]), SCALES[2], radius)
+    chosen = (costs[:, 0] - costs[:, 1] > margin)[:, None]
+    velocity, acceleration = (torch.where(chosen, x[:, :, height:], x[:, :, :height]) for x in both)
+    return velocity, acceleration
 
 
 def corrected(frames: Tensor, offsets: Sequence[int], path: Path, scale: int, radius: int, iterations: int) -> Path:
@@ -86,99 +93,121 @@ def corrected(frames: Tensor, offsets: Sequence[int], path: Path, scale: int, ra
 
 def moving(codes: Tensor, deviation: Tensor, offsets: Sequence[int], velocity: Tensor, acceleration: Tensor) -> Tensor:
     """Return where paths at scale 2 fit the codes (see `paths`) better than no motion does, beyond what noise explains:
-    bool [h, w].
+    bool [B, h, w].
     """
     radius, margin = STILL
-    nothing = torch.zeros_like(velocity)
-    still, moved = (_spread(codes, deviation, offsets, *path) for path in ((nothing,) * 2, (velocity, acceleration)))
-    return box_mean((still - moved)[None], radius)[0] * (2 * radius + 1) ** 2 > margin
+    unit = (SCALES[-1] / deviation)[:, None]
+    moved, there, kept = look_with_noise(codes, (velocity, acceleration), offsets, SCALES[-1])
+    gain = _spread(look_still(codes), None, None, unit).sub_(_spread(moved, there, kept, unit))
+    return box_mean(gain, radius) * (2 * radius + 1) ** 2 > margin
 
 
-def _spread(codes: Tensor, deviation: Tensor, offsets: Sequence[int], velocity: Tensor, acceleration: Tensor) -> Tensor:
-    """Return misfits of moved frames to their mean, summed over frames [h, w]; 1 for one that the path leaves."""
-    scale = SCALES[-1]
-    moved = [displacement(velocity, acceleration, offset, scale) for offset in offsets]
-    seen, there = (torch.stack(x) for x in zip(*map(look, codes, moved), strict=True))
-    count = there.sum(0)
-    mean = (seen * there).sum(0) / count
-    noise = torch.stack([kept_noise(x) for x in moved]) * (1 - 1 / count)
-    return torch.where(there > 0, misfit((seen - mean) * (scale / deviation), noise), 1.0).sum(0)
+def _spread(seen: Tensor, there: Tensor | None, kept: Tensor | None, unit: Tensor) -> Tensor:
+    """Return misfits of seen frames [B, K, h, w] to their mean, in units of noise, summed over frames [B, h, w].
+
+    A frame that is not `there` counts 1; None: all are. `kept` is the share of the noise; None: all of it.
+    """
+    frames = seen.shape[1]
+    if there is None or kept is None:
+        difference = (seen - seen.sum(1, keepdim=True) / frames).mul_(unit)
+        return misfit(difference, torch.zeros_like(unit).expand_as(difference), 1 - 1 / frames).sum(1)
+    count = there.sum(1, keepdim=True)
+    mean = (seen * there).sum(1, keepdim=True) / count
+    difference = (seen - mean).mul_(unit)
+    parts = misfit(difference, torch.zeros_like(unit).expand_as(difference), kept.mul_(1 - 1 / count))
+    return parts.mul_(there).add_(1 - there).sum(1)
+
+
+@dataclass(frozen=True)
+class Times:
+    """Powers of offsets that are independent of each other and of 1: k less its mean, and q = k^2/2 less its part of k
+    and of 1.
+    """
+
+    rows: Tensor  # [2, K] = (k, q)
+    fast: float  # sum of k^2
+    bent: float  # sum of q^2
+    mix: float  # of k in k^2/2
+    far: int  # the largest |k| before the mean was taken off
+
+
+@lru_cache(maxsize=64)
+def times_of(offsets: tuple[int, ...], device: torch.device) -> Times:
+    """Return the powers of offsets, on a device."""
+    k = torch.tensor(offsets, dtype=torch.float32)
+    q = k * k / 2
+    k = k - k.mean()
+    q = q - q.mean()
+    fast = float(k @ k)
+    # Where the reference is not in the middle of the window, k and k^2 / 2 go together; without that their equations
+    # fall apart into two.
+    mix = float(k @ q) / fast if fast else 0.0
+    q = q - mix * k
+    far = max(abs(offset) for offset in offsets)
+    return Times(torch.stack([k, q]).to(device), fast, float(q @ q), mix, far)
 
 
 def correct(
     frames: Tensor, offsets: Sequence[int], velocity: Tensor, acceleration: Tensor, scale: int, radius: int
-) -> tuple[Tensor, Tensor]:
-    """Return velocity and acceleration [2, h, w] after one step of Gauss-Newton over about 4 radius + 1 cells.
+) -> Path:
+    """Return velocity and acceleration [B, 2, h, w] after one step of Gauss-Newton over about 4 radius + 1 cells.
 
     The step makes moved frames equal to their weighted mean. In time, velocity and acceleration are made independent:
     with k and q = k^2/2 about their means, q' = q - mix k has no part of k.
     """
     information = float(scale**2)  # of a cell: 1 / variance of the noise
-    k = torch.tensor([float(offset) for offset in offsets])
-    q = k * k / 2
-    k = k - k.mean()
-    q = q - q.mean()
-    fast = float(k @ k)
-    if fast == 0:
+    times = times_of(tuple(offsets), frames.device)
+    if times.fast == 0:
         return velocity, acceleration
-    # Where the reference is not in the middle of the window, k and k^2 / 2 go
-    # together; without that their equations fall apart into two.
-    mix = float(k @ q) / fast
-    q = q - mix * k
-    bent = float(q @ q)
-    mean, errors, share = _errors(frames, offsets, velocity, acceleration, scale)
-    along = torch.tensordot(
-        torch.stack([k, q]), errors, 1
-    )  # [2, h, w]: errors that grow with time, and with its square
-    edge = functional.pad(mean[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    slope = torch.stack([edge[2:, 1:-1] - edge[:-2, 1:-1], edge[1:-1, 2:] - edge[1:-1, :-2]]) / 2
-    products = torch.stack(
-        [*(share * slope.square()), share * slope[0] * slope[1], *(slope * along[0]), *(slope * along[1])],
+    mean, errors, share = _errors(frames, offsets, (velocity, acceleration), scale)
+    along = (times.rows @ errors.flatten(2)).view(-1, 2, *errors.shape[2:])  # errors that grow with k, and with q
+    edge = functional.pad(mean[:, None], (1, 1, 1, 1), mode="replicate")
+    slope = torch.cat([edge[..., 2:, 1:-1] - edge[..., :-2, 1:-1], edge[..., 1:-1, 2:] - edge[..., 1:-1, :-2]], dim=1)
+    slope /= 2
+    share = share[:, None]
+    products = torch.cat(
+        [share * slope.square(), share * slope[:, :1] * slope[:, 1:], slope * along[:, :1], slope * along[:, 1:]], dim=1
     )
-    yy, xx, yx, *pulls = smooth_mean(products, radius) * (information * (2 * radius + 1) ** 2)
-    far = max(abs(offset) for offset in offsets)
+    sums = smooth_mean(products, radius).mul_(information * (2 * radius + 1) ** 2)
+    yy, xx, yx = sums[:, :3].split(1, dim=1)
     # A prior on the size of a correction keeps blocks with one edge, or none, from running along it.
     prior = (scale / CORRECTION) ** 2
-    dv = _limited(_solved(yy * fast + prior, yx * fast, xx * fast + prior, -torch.stack(pulls[:2])), 1.5 / far)
+    dv = _solved(yy * times.fast + prior, yx * times.fast, xx * times.fast + prior, -sums[:, 3:5])
+    dv = _limited(dv, 1.5 / times.far)
     da = torch.zeros_like(dv)
-    if bent > 1e-6:
+    if times.bent > 1e-6:
         prior = (scale / ACCELERATION) ** 2
-        pull = -torch.stack(pulls[2:]) - prior / scale * acceleration
-        da = _limited(_solved(yy * bent + prior, yx * bent, xx * bent + prior, pull), 3 / far**2)
-    moved = torch.cat([velocity + scale * (dv - mix * da), acceleration + scale * da])
+        pull = -sums[:, 5:] - prior / scale * acceleration
+        da = _limited(
+            _solved(yy * times.bent + prior, yx * times.bent, xx * times.bent + prior, pull), 3 / times.far**2
+        )
+    moved = torch.cat([velocity + scale * (dv - times.mix * da), acceleration + scale * da], dim=1)
     told = yy + xx
-    sums = smooth_mean(torch.cat([moved * (told + 1), (told + 1)[None]]), radius)
+    means = smooth_mean(torch.cat([moved * (told + 1), told + 1], dim=1), radius)
     # Flat blocks know nothing of their motion, and follow those around that do.
-    moved = torch.lerp(moved, sums[:4] / sums[4], STIFFNESS / (STIFFNESS + told))
-    return moved[:2], moved[2:]
+    moved = torch.lerp(moved, means[:, :4] / means[:, 4:], STIFFNESS / (STIFFNESS + told))
+    return moved[:, :2], moved[:, 2:]
 
 
-def _errors(
-    frames: Tensor, offsets: Sequence[int], velocity: Tensor, acceleration: Tensor, scale: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mean of the moved frames [h, w], their weighted deviations from it [K, h, w], the mean vote [h, w]."""
-    seen, votes = zip(
-        *(
-            look(frame, displacement(velocity, acceleration, offset, scale))
-            for frame, offset in zip(frames, offsets, strict=True)
-        ),
-        strict=True,
-    )
-    moved = torch.stack(seen)
-    inside = torch.stack(votes)
-    mean = (moved * inside).sum(0) / inside.sum(0)
-    misfit = box_mean((moved - mean).square_(), 1) * (scale**2 / MISFIT)
+def _errors(frames: Tensor, offsets: Sequence[int], path: Path, scale: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean of the moved frames [B, h, w], their weighted deviations from it [B, K, h, w], and the mean vote
+    [B, h, w].
+    """
+    moved, inside = look(frames, path, offsets, scale)
+    mean = (moved * inside).sum(1, keepdim=True) / inside.sum(1, keepdim=True)
+    vote = box_mean((moved - mean).square_(), 1).mul_(scale**2 / MISFIT).square_().add_(1)
     # Robust weights: what fits badly loses its vote, without a threshold.
-    vote = inside / (1 + misfit.square_())
-    mean = (moved * vote).sum(0) / vote.sum(0).clamp_(min=1e-6)
-    return mean, (moved - mean).mul_(vote), vote.mean(0)
+    vote = torch.div(inside, vote, out=vote)
+    mean = (moved * vote).sum(1, keepdim=True) / vote.sum(1, keepdim=True).clamp_(min=1e-6)
+    return mean[:, 0], moved.sub_(mean).mul_(vote), vote.mean(1)
 
 
 def _solved(yy: Tensor, yx: Tensor, xx: Tensor, pull: Tensor) -> Tensor:
-    """Return the solution [2, h, w] of [[yy, yx], [yx, xx]] solution = pull [2, h, w], pixel by pixel."""
-    return torch.stack([xx * pull[0] - yx * pull[1], yy * pull[1] - yx * pull[0]]) / (yy * xx - yx * yx)
+    """Return the solution [B, 2, h, w] of [[yy, yx], [yx, xx]] solution = pull [B, 2, h, w], pixel by pixel."""
+    down, right = pull.split(1, dim=1)
+    return torch.cat([xx * down - yx * right, yy * right - yx * down], dim=1) / (yy * xx - yx * yx)
 
 
 def _limited(step: Tensor, most: float) -> Tensor:
-    """Return steps [2, h, w] shortened to `most`."""
-    return step * (most / (step[0].square() + step[1].square()).sqrt_().clamp_(min=most))
+    """Return steps [B, 2, h, w] shortened to `most`."""
+    return step * (most / step.square().sum(1, keepdim=True).sqrt_().clamp_(min=most))

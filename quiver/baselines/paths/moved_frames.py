@@ -1,30 +1,36 @@
-"""Sees frames along paths p + k v + k^2/2 a, and means of squares of pixels.
+"""Sees frames along paths p + k v + k^2/2 a, and means of squares of pixels, for batches of windows on any device.
 
-Fields are [2, H, W] = (down, right), in pixels of the full frame per frame, at cells of one scale.
+Fields are [B, 2, H, W] = (down, right), in pixels of the full frame per frame, at cells of one scale. Several fields of
+the same frames may lie below each other: [B, 2, C * H, W].
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-SCALES = (8, 4, 2)  # px of the full frame per cell, along one side
+from quiver.device import is_gpu
 
-Path = tuple[Tensor, Tensor]  # velocity and acceleration [2, h, w]
+SCALES = (8, 4, 2)  # px of the full frame per cell, along one side
+CHUNK = 1 << 20  # cells that are followed at a time on a CPU, whose cache then holds them
+
+Path = tuple[Tensor, Tensor]  # velocity and acceleration [B, 2, h, w]
 
 
 def box_mean(image: Tensor, radius: int) -> Tensor:
-    """Return means of squares of 2 radius + 1 pixels of [N, H, W]; beyond the border the last pixel repeats."""
+    """Return means of squares of 2 radius + 1 pixels of [..., H, W]; beyond the border the last pixel repeats."""
     side = 2 * radius + 1
-    grown = functional.pad(image[:, None], (radius,) * 4, mode="replicate")[:, 0]
-    return _sums(_sums(grown, side, 2), side, 1) / side**2
+    height, width = image.shape[-2:]
+    grown = functional.pad(image.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
+    return _sums(_sums(grown, side, 3), side, 2).div_(side**2).view(image.shape)
 
 
 def smooth_mean(image: Tensor, radius: int) -> Tensor:
-    """Return box means of box means [N, H, W]. No wave is turned into its negative, as one box mean does: corrections
+    """Return box means of box means [..., H, W]. No wave is turned into its negative, as one box mean does: corrections
     that are averaged so converge.
     """
     return box_mean(box_mean(image, radius), radius)
@@ -51,33 +57,101 @@ def _sums(x: Tensor, count: int, dim: int) -> Tensor:
 
 
 def kept_noise(moved: Tensor) -> Tensor:
-    """Return the share of the noise's variance [..., H, W] that is left at p + moved [2, ..., H, W], seen by `look`."""
+    """Return the share of the noise's variance [..., H, W] that is left at p + moved [..., 2, H, W], seen by `look`."""
     part = moved - moved.floor()
     # The sum of squared bilinear weights: between pixels a mean of two has half of the noise.
-    share = part.square() + (1 - part).square()
-    return share[0] * share[1]
+    share = part.square()
+    share += part.neg_().add_(1).square_()
+    return share.select(-3, 0) * share.select(-3, 1)
 
 
-def displacement(velocity: Tensor, acceleration: Tensor, offset: int, scale: int = 1) -> Tensor:
-    """Return where paths lead after `offset` frames, [2, H, W], in cells of a scale."""
-    return (velocity * offset + acceleration * (offset * offset / 2)) / scale
+def look(
+    frames: Tensor, path: Path, offsets: Sequence[int], scale: int = 1, size: tuple[int, int] | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return frames [B, K, h, w] seen where paths [B, 2, C * h, w] lead after `offsets`, [B, K, C * h, w], bilinear,
+    and 1 where that lies inside, else 0.
 
-
-def look(image: Tensor, moved: Tensor, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
-    """Return an image [H, W] seen at p + moved [2, H, W], bilinear, and 1 where that lies inside, else 0.
-
-    Inside are the first rows and columns, `size` of them, of an image that was filled; None: all.
+    Inside are the first rows and columns, `size` of them, of frames that were filled; None: all.
     """
-    height, width = image.shape
-    rows, columns = image.shape if size is None else size
-    y = torch.arange(height, dtype=image.dtype)[:, None] + moved[0]
-    x = torch.arange(width, dtype=image.dtype)[None] + moved[1]
-    inside = (y >= -0.5) & (y <= rows - 0.5) & (x >= -0.5) & (x <= columns - 0.5)
-    grid = torch.stack([x.mul_(2 / max(width - 1, 1)).sub_(1), y.mul_(2 / max(height - 1, 1)).sub_(1)], dim=-1)
-    seen = functional.grid_sample(image[None, None], grid[None], padding_mode="border", align_corners=True)
-    return seen[0, 0], inside.to(image.dtype)
+    seen, inside, _ = _looked(frames, path, offsets, scale, size, noise=False)
+    return seen, inside
+
+
+def look_with_noise(frames: Tensor, path: Path, offsets: Sequence[int], scale: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what `look` does, and the share of the noise's variance that is left there, [B, K, C * h, w]."""
+    seen, inside, kept = _looked(frames, path, offsets, scale, None, noise=True)
+    assert kept is not None
+    return seen, inside, kept
+
+
+def look_still(frames: Tensor) -> Tensor:
+    """Return frames [B, K, h, w] as `look` sees them without motion, by one grid for all."""
+    batch, _, height, width = frames.shape
+    first, unit = _lattice(height, width, height, frames.device)
+    grid = (first * unit).sub_(1).permute(1, 2, 0).expand(batch, -1, -1, -1)
+    return functional.grid_sample(frames, grid, padding_mode="border", align_corners=True)
+
+
+def _looked(
+    frames: Tensor, path: Path, offsets: Sequence[int], scale: int, size: tuple[int, int] | None, noise: bool
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    batch, count, height, width = frames.shape
+    velocity, acceleration = (field.flip(1)[:, None] / scale for field in path)  # (right, down), as grids have it
+    rows = velocity.shape[-2]
+    first, unit = _lattice(height, width, rows, frames.device)
+    last = [side - 0.5 for side in size or (height, width)]
+    times = powers(tuple(offsets), frames.device)
+    cells = batch * rows * width
+    step = count if is_gpu(frames.device) else max(1, min(count, CHUNK // cells))
+    found: list[list[Tensor]] = [[], [], []]
+    for start in range(0, count, step):
+        part = slice(start, start + step)
+        place = velocity * times[0, part]
+        place += acceleration * times[1, part]
+        if noise:
+            found[2].append(kept_noise(place))
+        place += first
+        found[1].append(_within(place[:, :, 0], last[1]).mul_(_within(place[:, :, 1], last[0])))
+        grid = place.mul_(unit).sub_(1).flatten(0, 1).permute(0, 2, 3, 1)
+        images = frames[:, part].reshape(-1, 1, height, width)
+        seen = functional.grid_sample(images, grid, padding_mode="border", align_corners=True)
+        found[0].append(seen.view(batch, -1, rows, width))
+    seen, inside = (_joined(parts) for parts in found[:2])
+    return seen, inside, _joined(found[2]) if noise else None
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
+
+
+@lru_cache(maxsize=64)
+def powers(offsets: tuple[int, ...], device: torch.device) -> Tensor:
+    """Return k and k^2/2 of offsets k, [2, K, 1, 1, 1]."""
+    found = torch.tensor([list(offsets), [k * k / 2 for k in offsets]], dtype=torch.float32)
+    return found[..., None, None, None].to(device)
+
+
+@lru_cache(maxsize=64)
+def _lattice(height: int, width: int, rows: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the places [2, rows, w] = (right, down) of cells, and the units of a grid, [2, 1, 1]."""
+    down = torch.arange(rows, device=device).remainder(height).to(torch.float32)
+    right = torch.arange(width, device=device, dtype=torch.float32)
+    places = torch.stack([right.expand(rows, width), down[:, None].expand(rows, width)])
+    unit = torch.tensor([2 / max(width - 1, 1), 2 / max(height - 1, 1)], dtype=torch.float32)[:, None, None]
+    return places, unit.to(device)
+
+
+def _within(place: Tensor, last: float) -> Tensor:
+    """Return 1 where a place lies between -0.5 and `last`, else 0. Floats: a truth value takes five times as long."""
+    return place.clamp(-0.5, last).eq_(place)
+
+
+def halved(image: Tensor) -> Tensor:
+    """Return means of 2 x 2 pixels of [..., H, W]; several times as fast as `avg_pool2d` on a CPU."""
+    columns = image[..., 0::2] + image[..., 1::2]
+    return (columns[..., 0::2, :] + columns[..., 1::2, :]).mul_(0.25)
 
 
 def enlarged(field: Tensor, shape: Sequence[int]) -> Tensor:
-    """Return a field [2, h, w] at another scale."""
-    return functional.interpolate(field[None], size=tuple(shape), mode="bilinear", align_corners=False)[0]
+    """Return a field [B, N, h, w] at another scale."""
+    return functional.interpolate(field, size=tuple(shape), mode="bilinear", align_corners=False)

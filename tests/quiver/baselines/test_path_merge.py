@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from merge_windows import one_frame
 from scipy.ndimage import gaussian_filter, shift
 from stats import assert_mean
 
@@ -10,6 +11,7 @@ from qsim.keys import Key
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import path_merge as pm
+from quiver.baselines.domain_tables import domain_tables
 from quiver.baselines.information_domain import FLOOR, information_domain
 
 EXPOSURE = 5e-4
@@ -18,7 +20,7 @@ SENSOR = QIS(0.8, 1.6, 0.2, 3)
 
 def merged(codes, t, sensor=SENSOR, window=11):
     domain = information_domain(sensor, EXPOSURE)
-    return next(pm.stream(lambda i: codes[i], len(codes), domain, window, range(t, t + 1)))
+    return one_frame(next(pm.stream(lambda i: codes[i], len(codes), domain, window, range(t, t + 1))))
 
 
 def plain_agreement(difference, variance):
@@ -40,8 +42,10 @@ def test_fine_detail_that_a_path_misses_costs_weight():
     """Stripes two pixels wide, moved by their width: means of 6 x 6 pixels hardly differ, cells of 2 x 2 do."""
     noise = np.random.default_rng(0).normal(0, 1, (24, 24)).astype(np.float32)
     stripes = np.where(np.arange(24) // 2 % 2, 2.0, -2.0).astype(np.float32)
-    variance = torch.ones(12, 12)
-    same, missed = (pm.agreement(torch.from_numpy(noise + x), variance).numpy() for x in (0 * stripes, stripes))
+    variance = torch.ones(1, 1, 12, 12)
+    same, missed = (
+        pm.agreement(torch.from_numpy(noise + x)[None, None], variance).numpy() for x in (0 * stripes, stripes)
+    )
     assert np.median(same) > 0.9
     assert np.median(missed) < 0.1
 
@@ -56,7 +60,17 @@ def test_weights_are_those_of_a_plain_program(seed):
     moved = rng.integers(0, 8, (len(offsets), height, width)).astype(np.float32)
     inside = (rng.random(moved.shape) < 0.8).astype(np.float32)
     inside[offsets.index(0)] = 1
-    found = pm.weights(torch.from_numpy(moved), torch.from_numpy(inside), offsets, domain).numpy()
+    groups = pm.groups_of(offsets)
+    places = [[i for i, offset in enumerate(offsets) if offset in group] for group in groups]
+    counts = np.stack([inside[place].sum(0) for place in places])
+    sums = np.stack([(moved * inside)[place].sum(0) for place in places])
+    beside = np.stack([moved[place].sum(0) for place in places[: pm.NEAR]])
+    given = [torch.from_numpy(x)[None] for x in (moved[offsets.index(0)], sums, counts, beside)]
+    weights, means, total_of_near, base = pm.group_weights(*given, domain_tables(domain, torch.device("cpu")))
+    found = np.zeros_like(moved)
+    found[offsets.index(0)] = 1
+    for g, place in enumerate(places):
+        found[place] = weights[0, g].numpy() * inside[place]
 
     def half(x):
         return x.reshape(height // 2, 2, width // 2, 2).mean((1, 3))
@@ -77,14 +91,17 @@ def test_weights_are_those_of_a_plain_program(seed):
         expected[at[k]] = inside[at[k]] * enlarged(plain_agreement(moved[at[k]] - moved[at[0]], 2 * variance))
     near = [at[k] for k in (-1, 0, 1) if k in at]
     total = expected[near].sum(0)
-    base = (expected[near] * moved[near]).sum(0) / total
+    base_code = (expected[near] * moved[near]).sum(0) / total
+    assert total_of_near[0].numpy() == pytest.approx(total, abs=1e-4)
+    assert base[0].numpy() == pytest.approx(base_code, abs=1e-4)
     for side in (-1, 1):
         for pair in ((2, 3), (4, 5)):
             group = [at[side * k] for k in pair if side * k in at]
             if group:
                 count = np.maximum(inside[group].sum(0), 1)
                 mean = (moved[group] * inside[group]).sum(0) / count
-                weight = enlarged(plain_agreement(mean - base, (half(1 / count) + half(1 / total)) * variance))
+                assert means[0, places.index(sorted(group))].numpy() == pytest.approx(mean, abs=1e-5)
+                weight = enlarged(plain_agreement(mean - base_code, (half(1 / count) + half(1 / total)) * variance))
                 expected[group] = weight * inside[group]
     assert found == pytest.approx(expected, abs=1e-4)
 
@@ -206,8 +223,8 @@ def test_a_shift_of_the_scene_by_a_pixel_shifts_the_answer():
 
 def test_what_lies_beyond_the_picture_has_no_weight(monkeypatch):
     """A side of 44 px is filled to 48: the four repeated columns counted as pixels of the picture."""
-    velocity = torch.zeros(2, 40, 48)
-    velocity[1] = 4.0
+    velocity = torch.zeros(1, 2, 40, 48)
+    velocity[:, 1] = 4.0
     monkeypatch.setattr(pm, "paths", lambda *_: (velocity, torch.zeros_like(velocity)))
     codes = np.random.default_rng(0).integers(0, 8, (11, 40, 44)).astype(np.uint8)
     found = merged(codes, 5)
