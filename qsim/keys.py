@@ -115,6 +115,7 @@ def words(key: Key, shape: tuple[int, ...], origin: tuple[int, int] = (0, 0), re
     require_counters(key, shape, origin)
     *frames, height, width = shape
     y, x = origin
+    # Four neighbouring columns of the full frame share a block of words: a crop draws what the full frame would.
     first = x >> 2
     last = (x + width + 3) >> 2
     blocks = (frames[0] if frames else 1, height, last - first)

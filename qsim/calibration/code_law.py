@@ -57,6 +57,7 @@ def code_law(
     below, by_at, by_noise, by_mean, by_spread = found
     shares = np.maximum(_bins(below, 1.0), 0.0)
     return Law(
+        # One odd pixel in a bin of no probability would decide the whole fit.
         (1 - FLOOR) * shares + FLOOR / shares.shape[1],
         _bins(-by_at * at, 0.0),
         _bins(-by_at / gain, 0.0),

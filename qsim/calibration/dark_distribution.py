@@ -196,6 +196,7 @@ def _profile(laws: _Laws) -> tuple[float, float]:
     def crossing(edge: int, beyond: int) -> float:
         if not 0 <= beyond < steps.size:
             return float(place[edge])
+        # Straight between two points of the grid, in the logarithm of the median.
         share = height[edge] / (height[edge] - height[beyond])
         return float(place[edge] + share * (place[beyond] - place[edge]))
 

@@ -196,6 +196,7 @@ def measure_sums(
     statistics = FrameStatistics(drawn, float(exposure), photons, histogram, ones, ones, unknown, unknown, unknown)
     if frames < 2 or planes < 2:
         return statistics
+    # Planes that depend on one another, as by afterpulses, make sums vary more than independent ones.
     observed = float((squares - ones**2 / frames).sum()) / (frames - 1)
     expected = float(statistics.pixel_variance.sum()) * planes
     return replace(statistics, dispersion=observed / expected if expected > 0 else float("nan"), sums=frames)

@@ -48,12 +48,14 @@ def without_warm(fit: Fit, darks: Sequence[FrameStatistics], good: Array) -> Arr
     size = 1 << (levels * frames - 1).bit_length()
     chances = np.array([_of_sum(shares, frames, size)[sums] for shares in law.shares])
     warm = chances[1:].mean(axis=0)
+    # Expectation and maximisation of the share of warm pixels, in a mixture with those of the fitted law.
     share = 0.01
     for _ in range(ROUNDS):
         hot = share * warm / ((1 - share) * chances[0] + share * warm)
         share = float(hot.mean())
     if share > MOST:
         return good
+    # A pixel is left out with its probability of being warm: a threshold would cut the tail of the others off.
     used = good.copy()
     used[good] = np.random.default_rng(SEED).random(sums.size) >= hot
     return used

@@ -161,6 +161,7 @@ def sample_of(
     found += [sensed(clip, sensing) for sensing in sensings]
     described: dict[str, DescribedStream] = {}
     for one in found:
+        # Numbered among all streams of the set, so that a field is the same stream in every clip.
         suffix = "" if len(every) == 1 else f"_{every.index(one.name)}"
         own: DescribedStream = {"packed": packed, "info": descriptions.values_of(one.info)}
         if "codes" in fields:

@@ -184,6 +184,7 @@ class _Warp:
         along = 2 * (self._p2 * x + self._p1 * y)
         off_x = x * (stretch + along) + square * self._p2 - across
         off_y = y * (stretch + along) + square * self._p1 - down
+        # The Jacobian of this distortion is symmetric, so that three numbers are enough.
         slope = 2 * _sum_of_powers([(i + 1) * term for i, term in enumerate(self._terms)], square)
         xx = stretch + x * x * slope + along + 4 * self._p2 * x
         yy = stretch + y * y * slope + along + 4 * self._p1 * y

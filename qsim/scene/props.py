@@ -105,6 +105,7 @@ def _turn_z(angle: float) -> Array:
 
 def _flattened(points: Array, codes: NDArray[np.integer], steps: int = 5) -> list[Array]:
     """Return loops of lines [N, 2] from a glyph's lines and quadratic curves."""
+    # Codes of matplotlib.path: 1 begins a loop, 2 draws a line, CURVE takes two points, a control and an end.
     loops: list[list[Array]] = []
     i = 0
     while i < len(codes):

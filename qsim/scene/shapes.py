@@ -203,6 +203,7 @@ def wire(path: ArrayLike, radius: float, sides: int = 8, closed: bool = False) -
     side = np.cross(tangent[0], np.eye(3)[int(np.argmin(np.abs(tangent[0])))])
     sides_along = []
     for along in [*tangent, tangent[0]]:
+        # Projected onto the next normal plane the side turns as little as it can: parallel transport.
         side = side - along * (side @ along)
         side = side / np.linalg.norm(side)
         sides_along.append(side)

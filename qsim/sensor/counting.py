@@ -254,6 +254,8 @@ class CountingSPAD(SPAD):
         share = self.dead_time / exposure
 
         def passed(k: Array, left: Array) -> Array:
+            # k or fewer counts: at most k arrivals in the time that k dead times
+            # leave, Q(k + 1, live). Near 1 its complement keeps the digits.
             live = arrivals[left] * np.maximum(1 - k * share, 0)
             u = below[left]
             v = above[left]

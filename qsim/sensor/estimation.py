@@ -280,6 +280,7 @@ def _crossing(likelihood: _Likelihood, grid: _Grid, table: Array, start: Array, 
     """
     photons = grid.photons
     size = len(grid.photons)
+    # The grid brackets the crossing: its nearest point that is low enough, and the next one towards the maximum.
     low_enough = table < target[:, None]
     if direction < 0:
         there = low_enough & (photons <= start[:, None])

@@ -122,6 +122,7 @@ class EventPixels:
         """Return the events until the next frame, whose photocurrent [H, W] in e-/s is `seconds` later."""
         growth, noise_rate, seen = self._follow(_checked(current), seconds)
         grown = self.change + growth
+        # Most pixels stay between both thresholds and advance together; the others go from event to event.
         quiet = (grown < self.on * (1 - REACHED)) & (grown > self.off * (REACHED - 1))
         if self.camera.refractory > 0:
             quiet &= self.held == 0

@@ -334,6 +334,7 @@ class Thresholds:
         steps = int((stop - start).max(initial=0))
         if not steps:
             return total
+        # A column of zeros at the end of each row, where pixels wait that are through before others.
         flat = np.column_stack([table, np.zeros(len(table))]).ravel()
         at = k * (width + 1) + start
         end = k * (width + 1) + width
@@ -341,6 +342,7 @@ class Thresholds:
         for _ in range(steps):
             total += weight * flat[at]
             n += 1
+            # P(n) = P(n - 1) mean / n: cheaper than the logarithm of a factorial.
             weight *= mean / n
             at = np.minimum(at + 1, end)
         return total
@@ -371,6 +373,8 @@ class BlurredSteps:
 
         variance = mean + self.noise**2
         x = np.clip((places - mean) / np.sqrt(variance), -40, 40)
+        # Edgeworth's series to third order (Abramowitz and Stegun, 26.2): all cumulants of the
+        # electrons equal their mean, and read noise adds to the second alone.
         k3, k4, k5 = (mean / variance ** (order / 2) for order in (3, 4, 5))
         h2 = x**2 - 1
         h3 = x**3 - 3 * x

@@ -285,7 +285,9 @@ def given(chain: Chain, electrons: Array) -> tuple[Array, Array]:
     if blur >= WIDE:
         codes[near], spread[near] = _wide(x[near], blur, top)
         return codes, spread
+    # From 1.25 on the first term of the series is below 1e-13, and rounding adds 1/12 and nothing else.
     if blur < 1.25:
+        # The series of a narrow blur has many terms; to count its few codes is cheaper.
         near |= blur < 0.3
         codes[~near], spread[~near] = _rounded(x[~near], blur)
     codes[near], spread[near] = _counted(x[near], blur, top)
@@ -297,6 +299,8 @@ def _rounded(x: Array, blur: float) -> tuple[Array, Array]:
     saw, product, square = (np.zeros(len(x)) for _ in range(3))
     for j in range(1, ceil(np.sqrt(NEGLIGIBLE / 2) / (pi * blur)) + 1):
         t = 2 * pi * j
+        # Rounding takes off a sawtooth. Its Fourier series, averaged over a
+        # normal z, is damped by exp(-(2 pi j blur)^2 / 2).
         size = (-1) ** (j + 1) / (pi * j) * np.exp(-((t * blur) ** 2) / 2)
         sine = size * np.sin(t * x)
         cosine = size * np.cos(t * x)
@@ -362,6 +366,7 @@ def _tail(z: Array, blur: float) -> tuple[Array, Array]:
         z**7 - 21 * z**5 + 105 * z**3 - 105 * z,
         z**8 - 28 * z**6 + 210 * z**4 - 420 * z**2 + 105,
     ]
+    # The derivatives of P along y: those of a normal tail are Hermite polynomials times its density.
     slopes = [tail, *((-1) ** (r + 1) * h * density / blur ** (r + 1) for r, h in enumerate(hermite))]
     first = blur * (density - z * tail)
     second = blur**2 * ((1 + z * z) * tail - z * density)

@@ -168,6 +168,7 @@ class Windows(Dataset[dict[str, Any]]):
         length, height, width = self.clip(clip).shape
         frame = int(rng.integers(length - settings.frames + 1))
         drift = self._drift(clip, rng)
+        # A crop that drifts up or left begins with that much room on this side.
         y, x = (
             int(rng.integers(side - settings.crop - abs(way) + 1)) + max(0, -way)
             for side, way in zip((height, width), (d * (settings.frames - 1) for d in drift), strict=True)

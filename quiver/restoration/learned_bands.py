@@ -66,6 +66,7 @@ class LearnedBands:
         mean = torch.tensor([float(light.mean())], device=device)
         reach = self.network.reach * rows
         found = np.empty_like(linear)
+        # Strips with the reach of the network around them give what the whole picture would, in less memory.
         for start in range(0, len(y), ROWS_AT_ONCE * rows):
             stop = min(start + ROWS_AT_ONCE * rows, len(y))
             first = max(0, start - reach)

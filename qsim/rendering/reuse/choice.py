@@ -94,6 +94,7 @@ def reused_mean(
     apart = (cleaned - best).mean(axis=0)
     change = (cleaned[0] - cleaned[1]) - (best[0] - best[1])
     gain = -(apart * (best - own).mean(axis=0) + change * z / 4)
+    # The share of the denoised picture with the least error of a tile, by that estimate: the minimum of a parabola.
     shares = _around(_sums(gain, TILE)) / np.maximum(_around(_sums(apart**2, TILE)), 1e-300)
     share = _spread(np.clip(shares, 0, 1), own.shape[1:])
     return keeping_mean(_mixed(own, best, cleaned, share), float(best.mean()), white)
@@ -103,6 +104,8 @@ def _mixed(own: Array, best: Array, cleaned: Array, share: Array) -> SharedMixtu
     mixed = share * cleaned + (1 - share) * best
     z = own[0] - own[1]
     middle = mixed.mean(axis=0)
+    # Without bias, from two halves of independent noise: (M - O)^2 exceeds the error of M by
+    # the variance of O, z^2 / 4, less twice their covariance, (M0 - M1) z / 4.
     squares = (middle - own.mean(axis=0)) ** 2 + (mixed[0] - mixed[1]) * z / 2 - z**2 / 4
     noise = (mixed[0] - mixed[1]) ** 2 / 4
     return SharedMixture(share, middle, mixed.min(axis=0), squares, z**2 / 4, noise, apart=mixed - own)

@@ -267,6 +267,7 @@ def _chunks(path: Path, raw: bytes) -> tuple[bytes, bytes | None]:
         raise ValueError(f"{path}: glTF container of version {version}; version 2 is read")
     if length > len(raw):
         raise ValueError(f"{path}: truncated: {len(raw)} bytes of {length}")
+    # A header of 12 bytes, then chunks: length, kind, content (glTF 2.0, 4.4).
     chunks = []
     at = 12
     while at + 8 <= length:

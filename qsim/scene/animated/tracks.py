@@ -99,6 +99,7 @@ class Track:
             return self.values[i].copy()
         if self.tangents is None:
             return (1 - s) * self.values[i] + s * self.values[i + 1]
+        # glTF 2.0, appendix C: cubic Hermite, whose stored tangents are per second.
         length = self.times[i + 1] - self.times[i]
         leave = self.tangents[1, i] * length
         arrive = self.tangents[0, i + 1] * length

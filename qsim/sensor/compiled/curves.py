@@ -74,10 +74,12 @@ def _fitted(cdf: Steps, slope: Steps, start: Array, stop: Array, brightest: floa
         width = (stop - start) / cells
         x = start + width * np.arange(cells + 1)
         per_x = slope(x * x) * 2 * x
+        # In x = sqrt(photons), where steps have the same width at any light.
         cubic = _hermite(cdf(x * x), per_x * width)
         middle = (x[:, 1:] + x[:, :-1]) / 2
         error = float(np.abs(cubic @ 0.5 ** np.arange(4) - cdf(middle * middle)).max())
         if error <= _ERROR:
+            # A relative error of the photons moves the chance by |slope| x / 2, since photons = x^2.
             margin = _ROUNDING + 2 * error + float(np.abs(per_x * x).max()) / 2 * _PHOTONS
             return Curves(start[:, 0], 1 / width[:, 0], cubic.astype(np.float32), margin, brightest)
         cells *= 2

@@ -127,6 +127,7 @@ def _traced(
         pair: Any, frame: Any, row: Any, arguments: list[Any], indices: list[Any], block: Any, high: Any, low: Any
     ) -> tuple[Any, Any]:
         index, below_y, below_t, mask_x, mask_y = indices
+        # A thread's index holds t, y and x in bit fields, whose widths are arguments: other sizes need no other kernel.
         t = index >> below_t
         y = (index & mask_y) >> below_y
         x = index & mask_x

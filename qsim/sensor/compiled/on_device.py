@@ -86,6 +86,7 @@ def _places(
     rest = number % (rows * threads)
     row = rest // threads
     column = 2 * (rest % threads) + side
+    # Threads begin at a multiple of four columns, as blocks of words do; the first may lie outside the crop.
     left = origin[1] & 3
     inside = (column >= left) & (column < left + shape[2])
     return ((frame + t) * shape[1] + row + y) * shape[2] + column - left, inside

@@ -23,6 +23,7 @@ def average_splat(image: Tensor, flow: Tensor) -> Tensor:
         height, width = image.shape[2:]
         x = torch.arange(width, dtype=dtype, device=flow.device) + flow[:, 0]
         y = torch.arange(height, dtype=dtype, device=flow.device)[:, None] + flow[:, 1]
+        # A channel of ones is splatted along: it adds up the weights that arrive.
         sources = torch.cat([image.to(dtype), image.new_ones(len(image), 1, height, width, dtype=dtype)], dim=1)
         sums = torch.zeros_like(sources).flatten(2)
         for column, share_x in _neighbours(x):
