@@ -84,6 +84,8 @@ class MomentLaw:
     def pushes(self, r: int, mean: Array, variance: Array, of_mean: Array, of_variance: Array) -> Array:
         """Return the score [4, n] of every pixel of a cell."""
         cell = self.cells[r]
+        # Derivatives of a normal log-likelihood: the mean over frames has
+        # variance v / n, the variance in time v^2 2 / (n - 1).
         by_mean = self.frames[r] * (cell.level - mean[r]) / self.variance[r]
         by_variance = 0.5 * (self.frames[r] - 1) * (cell.in_time / variance[r] - 1) / variance[r]
         return np.outer(of_mean[:, r], by_mean) + np.outer(of_variance[:, r], by_variance)

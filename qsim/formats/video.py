@@ -244,6 +244,7 @@ def _turn(path: Path) -> Turn | None:
         data = None if frame is None else frame.side_data.get("DISPLAYMATRIX")
         if data is None:
             return None
+        # A matrix of 3 x 3 fixed-point numbers of 16.16 bits, of which four turn the picture.
         numbers = np.frombuffer(bytes(data), np.int32)[[0, 1, 3, 4]]
     parts = np.rint(numbers / 65536).astype(int)
     if np.abs(numbers / 65536 - parts).max() > 1e-3 or abs(int(parts[0] * parts[3] - parts[1] * parts[2])) != 1:

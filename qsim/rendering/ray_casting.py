@@ -58,6 +58,7 @@ class RayCaster:
             chosen = np.flatnonzero(self._passes(hits))
             if not len(chosen):
                 break
+            # A little behind the surface that lets light pass, or the ray would meet it again.
             start = hits.distance[chosen] * (1 + GAP)
             moved = origin[:, None] + directions[:, chosen] * start
             behind = self._first(moved, directions[:, chosen])

@@ -309,6 +309,7 @@ def _contains(loop: Array, point: Array) -> bool:
     x, y = point
     p = loop
     q = np.roll(loop, -1, axis=0)
+    # A ray to the right crosses the loop an odd number of times from inside; one end of each edge counts, not both.
     straddles = (p[:, 1] > y) != (q[:, 1] > y)
     p = p[straddles]
     q = q[straddles]

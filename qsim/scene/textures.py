@@ -134,6 +134,7 @@ def cells(rng: np.random.Generator, count: int = 120, size: int = 512, joint: fl
     seeds = rng.random((count, 2))
     y, x = (np.mgrid[:size, :size] + 0.5) / size
     distance, index = cKDTree(seeds, boxsize=1.0).query(np.stack([y, x], -1), k=2)
+    # The distances to the two nearest seeds are equal on the edge between cells.
     gap = (distance[..., 1] - distance[..., 0]) * np.sqrt(count)
     face = np.clip((gap - joint / 2) / 0.06, 0, 1)
     tone = rng.uniform(0.3, 0.95, count)[index[..., 0]] * (0.8 + 0.3 * noise(rng, (size, size), 0.8))

@@ -97,6 +97,7 @@ class Rows:
         """Yield (number, crop of these lines, lines) for each run of lines of a crop with the same number."""
         start = crop[self.axis]
         own = numbers[start : start + crop[2 + self.axis]]
+        # Lines of one number are read together: one block of a frame instead of many lines.
         edges = [0, *(np.flatnonzero(np.diff(own)) + 1).tolist(), len(own)]
         for first, last in itertools.pairwise(edges):
             y, x, h, w = crop

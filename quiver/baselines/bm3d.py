@@ -90,6 +90,7 @@ def wavelet_matrix() -> Tensor:
     one = np.eye(BLOCK)
     size = BLOCK
     while size > 1:
+        # One level halves the averages that the last one left; the differences stay as they are.
         level = np.zeros((size, size))
         for k in range(size // 2):
             np.add.at(level[k], (2 * k + np.arange(-4, 6)) % size, low)

@@ -374,6 +374,7 @@ def _change(light: Array) -> float:
         return 0.0
     ratios = bright / bright.mean(axis=0)
     factors = np.median(ratios, axis=1)
+    # Medians throughout: things that move are outliers among the squares, and light is what all of them share.
     spread = DEVIATION * np.median(np.abs(ratios - factors[:, None]), axis=1)
     errors = MEDIAN * spread / np.sqrt(bright.shape[1])
     low = int(factors.argmin())

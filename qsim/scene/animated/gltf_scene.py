@@ -444,6 +444,7 @@ def _repeated(piece: FilePiece, matrices: np.ndarray) -> FilePiece:
     faces = np.where(mirrored[:, None, None], piece.faces[None, :, ::-1], piece.faces[None]) + starts[:, None, None]
     normals = None
     if piece.normals is not None:
+        # Normals stay at right angles to surfaces by the inverse transpose.
         normals = np.einsum("kij,vj->kvi", np.linalg.inv(matrices[:, :3, :3]).transpose(0, 2, 1), piece.normals)
         normals = (normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)).reshape(-1, 3)
 

@@ -56,6 +56,8 @@ class DarkSpread:
         low = self.hot_from
         high = self.hot_to
         a = self.tail
+        # Of a power law with the exponent -(a + 1) between both ends; the
+        # rest is log-normal, with the mean exp(spread^2 / 2).
         norm = low**-a - high**-a
         hot = np.log(high / low) / norm if a == 1 else a / (1 - a) * (high ** (1 - a) - low ** (1 - a)) / norm
         return (1 - self.hot_share) * float(np.exp(self.spread**2 / 2)) + self.hot_share * float(hot)
