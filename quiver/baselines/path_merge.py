@@ -1,7 +1,7 @@
 """Restores by merging frames along smooth paths: each pixel is a mean of the frames that agree, and knows how many.
 
-    codes -> phi of pooled codes at scales 8, 4, 2 -> paths (paths/motion_paths.py) -> moved codes -> weights ->
-    mean code, count
+    codes -> phi of pooled codes at scales 8, 4, 2 -> shake of the camera and paths (paths/motion_paths.py) ->
+    moved codes -> weights -> mean code, count
 
 Frames beside the reference are compared with it; farther ones, in pairs, with the mean of the nearest three. Two
 statistics compare: the squared mean differences of 6 x 6 and of 2 x 2 pixels over their exact variance, averaged
@@ -33,8 +33,8 @@ from torch import Tensor
 from qsim.sensor.sensor import Sensor
 from quiver.baselines.domain_tables import DomainTables, domain_tables
 from quiver.baselines.information_domain import InformationDomain, information_domain
-from quiver.baselines.paths.motion_paths import paths
-from quiver.baselines.paths.moved_frames import CHUNK, SCALES, Path, box_mean, enlarged, halved, look
+from quiver.baselines.paths.motion_paths import Moves, moves
+from quiver.baselines.paths.moved_frames import CHUNK, SCALES, box_mean, enlarged, halved, look
 from quiver.baselines.sliding_window import check_window, checked_codes, in_units, look_ahead
 from quiver.device import is_gpu
 
@@ -98,9 +98,9 @@ def merge(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Mer
     pooled = halved(codes)
     # The noise that the search for paths expects, from the window without motion: only its size matters there.
     deviation = tables.variance(box_mean(pooled.mean(1), 2)).sqrt()
-    path = paths(window.pyramid, offsets, pooled, deviation)
+    found = moves(window.pyramid, offsets, pooled, deviation)
     alone = codes[:, offsets.index(0)]
-    sums, counts, beside = _group_sums(codes, path, offsets, window.size)
+    sums, counts, beside = _group_sums(codes, found, offsets, window.size)
     weights, means, near_total, near_mean = group_weights(alone, sums, counts, beside, tables)
     total, mean_code = _weighted(alone, weights, sums, counts)
     return Merged(
@@ -123,7 +123,7 @@ def groups_of(offsets: Sequence[int]) -> tuple[tuple[int, ...], ...]:
 
 
 def _group_sums(
-    codes: Tensor, path: Path, offsets: Sequence[int], size: tuple[int, int]
+    codes: Tensor, found: Moves, offsets: Sequence[int], size: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return sums of the moved frames of each group where they lie in the picture, [B, G, H, W], how many do, and the
     frames beside the reference wherever they lie, [B, 2, H, W]: 0 where there is none.
@@ -139,7 +139,7 @@ def _group_sums(
     for first in range(0, len(moving), step):
         chosen = moving[first : first + step]
         frames = torch.stack([codes[:, i] for i in chosen], dim=1)
-        seen, inside = look(frames, path, [offsets[i] for i in chosen], 1, size)
+        seen, inside = look(frames, found.path, [offsets[i] for i in chosen], 1, size, found.shake[:, chosen])
         for n, i in enumerate(chosen):
             g = place[offsets[i]]
             counts[:, g] += inside[:, n]

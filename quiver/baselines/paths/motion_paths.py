@@ -27,6 +27,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from quiver.baselines.paths.camera_motion import camera_motion, field, parted, seen_without, slope
 from quiver.baselines.paths.moved_frames import (
     SCALES,
     Path,
@@ -42,6 +43,12 @@ from quiver.baselines.paths.path_search import misfit, misfits_of, neighbours, s
 SPEED = 18.0  # px/frame, the fastest that is tried; refinement goes slightly beyond
 SLOW = 3.0  # px/frame, the fastest that is tried at scale 4
 STILL = (3, 60.0)  # radius of the block [cells of scale 2] over which a path must fit better than none, and by how much
+GAIN = 120.0  # by how much a camera's motion must fit the frame better: sixty free numbers gain half of it from noise
+BLOCK = 8  # cells of scale 2: side of the blocks that vote on the camera's motion
+CERTAIN = 4.0  # of a motion's square in deviations of the noise, at which a block has half a vote
+AGREE = 0.3  # of the votes that are expected if all blocks move as the camera does
+SURE = 3.0  # deviations of the votes of blocks that know nothing
+PAN = 10.0  # the same by how much than the smooth motion of the camera
 DETAIL = (6, 40.0)  # radius of the block [cells of scale 2] over which slow paths must fit better, and by how much
 REFINE = ((4, 2, 2), (2, 4, 3))  # (scale, radius of the mean that is taken twice, in cells; iterations)
 CORRECTION = 1.0  # px/frame, expected size of a correction of v
@@ -50,12 +57,77 @@ MISFIT = 3.0  # variances of the noise at which a frame has half a vote
 STIFFNESS = 50.0  # information of a block below which it follows its neighbours
 
 
-def paths(pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, deviation: Tensor) -> Path:
+@dataclass(frozen=True, eq=False)
+class Moves:
+    """Where every place of a frame goes: along its path, and from there as the camera shakes."""
+
+    path: Path  # [B, 2, H, W] of the full frame
+    shake: Tensor  # [B, K, 2, 3], of camera_motion.py, what no path follows; zero for windows without it
+
+
+def moves(pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, deviation: Tensor) -> Moves:
+    """Return how every place moves; arguments as of `paths`.
+
+    The motion of the camera is found first, and taken where the places that can tell it agree. What is smooth in time
+    of it is one more path for every place. The rest is shake, which counts where it fits better than none; paths are
+    found in the frames without it.
+    """
+    fine = SCALES[-1]
+    camera = camera_motion(pyramid, offsets)
+    smooth, shake = parted(camera, offsets)
+    nothing = (torch.zeros_like(codes[:, :1].expand(-1, 2, -1, -1)),) * 2
+    unit = (fine / deviation)[:, None]
+    rest = _spread(look_still(codes), None, None, unit)
+    steady, whole = (
+        _spread(*look_with_noise(codes, nothing, offsets, fine, motion), unit) for motion in (camera - shake, camera)
+    )
+    mean = seen_without(pyramid[fine], camera, fine)[0].mean(1)
+    pans = agrees(rest - whole, told(mean, camera))
+    shakes = (pans & agrees(steady - whole, told(mean, shake)))[:, None, None, None]
+    shake = torch.where(shakes, shake, 0.0)
+    without = {scale: torch.where(shakes, seen_without(x, shake, scale)[0], x) for scale, x in pyramid.items()}
+    codes = torch.where(shakes, seen_without(codes, shake, fine)[0], codes)
+    return Moves(paths(without, offsets, codes, deviation, torch.where(pans[:, None, None, None], smooth, 0.0)), shake)
+
+
+def told(mean: Tensor, camera: Tensor) -> Tensor:
+    """Return how much a cell of the mean frame [B, h, w] tells of a motion [B, K, 2, 3]: [B, h, w].
+
+    It is the square of what the motion changes there, in variances of the noise: what a cell gains if the motion is
+    true, and loses if it is not.
+    """
+    changes = (slope(mean)[:, None] * field(camera, *mean.shape[-2:])).sum(2)
+    return changes.square_().sum(1)  # of cells / scale px over 1 / scale of noise
+
+
+def agrees(gain: Tensor, told: Tensor) -> Tensor:
+    """Return whether frames move as their camera does, bool [B], from what their cells gain and tell [B, h, w].
+
+    Blocks vote, each with the certainty of its answer: a body that moves has few of them, however much it gains.
+    """
+    whole = functional.avg_pool2d(torch.stack([gain, told], dim=1), BLOCK, ceil_mode=True) * BLOCK**2
+    gains, tells = whole.flatten(2).unbind(1)
+    certain = tells / (tells + CERTAIN)
+    # a gain has the mean E = tells and the deviation 2 sqrt(E): its sign is right by so much more often than wrong
+    expected = (certain * torch.erf((tells / 8).sqrt())).sum(1)
+    votes = (certain * gains.sign()).sum(1)
+    by_chance = certain.square().sum(1).sqrt()
+    return (votes > AGREE * expected) & (votes > SURE * by_chance) & (gain.flatten(1).sum(1) > GAIN)
+
+
+def paths(
+    pyramid: dict[int, Tensor],
+    offsets: Sequence[int],
+    codes: Tensor,
+    deviation: Tensor,
+    smooth: Tensor | None = None,
+) -> Path:
     """Return velocity and acceleration [B, 2, H, W] of frames at each scale: {scale: [B, K, H/scale, W/scale]}.
 
     `offsets` are the frames' places in time; 0 is the reference. The noise of a frame at a scale has the deviation
     1 / scale, as phi of pooled codes nearly has. Mean `codes` [B, K, H/2, W/2] of scale 2 and the `deviation`
-    [B, H/2, W/2] of one code tell what moves: of four codes of one bit, phi has up to 1.8 times that variance.
+    [B, H/2, W/2] of one code tell what moves: of four codes of one bit, phi has up to 1.8 times that variance. A path
+    must fit better than no motion, or than the `smooth` motion of the camera, velocity and acceleration [B, 2, 2, 3].
     """
     coarse, middle, fine = (pyramid[scale] for scale in SCALES)
     shape = middle.shape[-2:]
@@ -64,10 +136,16 @@ def paths(pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, dev
     start = torch.cat([fast, slow])
     found = corrected(middle.repeat(2, 1, 1, 1), offsets, (start, torch.zeros_like(start)), *REFINE[0])
     velocity, acceleration = corrected(fine, offsets, _better(fine, offsets, found), *REFINE[1])
+    found = (velocity, acceleration)
+    base = None if smooth is None else field(smooth, *codes.shape[-2:])
+    taken = moving(codes, deviation, offsets, found, base)
     full = [SCALES[-1] * side for side in codes.shape[-2:]]
-    moves = moving(codes, deviation, offsets, velocity, acceleration)
-    moves = functional.interpolate(moves[:, None].to(velocity.dtype), size=full)
-    return enlarged(velocity, full) * moves, enlarged(acceleration, full) * moves
+    taken = functional.interpolate(taken[:, None].to(velocity.dtype), size=full)
+    if smooth is None:
+        return enlarged(velocity, full) * taken, enlarged(acceleration, full) * taken
+    pan = field(smooth, *full)
+    velocity, acceleration = (torch.lerp(pan[:, n], enlarged(x, full), taken) for n, x in enumerate(found))
+    return velocity, acceleration
 
 
 def _better(frames: Tensor, offsets: Sequence[int], found: Path) -> Path:
@@ -91,15 +169,21 @@ def corrected(frames: Tensor, offsets: Sequence[int], path: Path, scale: int, ra
     return path
 
 
-def moving(codes: Tensor, deviation: Tensor, offsets: Sequence[int], velocity: Tensor, acceleration: Tensor) -> Tensor:
+def moving(codes: Tensor, deviation: Tensor, offsets: Sequence[int], path: Path, base: Tensor | None = None) -> Tensor:
     """Return where paths at scale 2 fit the codes (see `paths`) better than no motion does, beyond what noise explains:
-    bool [B, h, w].
+    bool [B, h, w]. A `base` [B, 2, 2, h, w], velocity and acceleration, stands for no motion; where it moves, paths
+    lose no sharpness against it, and must only fit better than by the numbers that they have free.
     """
     radius, margin = STILL
     unit = (SCALES[-1] / deviation)[:, None]
-    moved, there, kept = look_with_noise(codes, (velocity, acceleration), offsets, SCALES[-1])
-    gain = _spread(look_still(codes), None, None, unit).sub_(_spread(moved, there, kept, unit))
-    return box_mean(gain, radius) * (2 * radius + 1) ** 2 > margin
+    least: Tensor | float = margin
+    if base is None:
+        still = _spread(look_still(codes), None, None, unit)
+    else:
+        still = _spread(*look_with_noise(codes, (base[:, 0], base[:, 1]), offsets, SCALES[-1]), unit)
+        least = torch.where(base.abs().amax((1, 2)) > 0, PAN, margin)
+    gain = still.sub_(_spread(*look_with_noise(codes, path, offsets, SCALES[-1]), unit))
+    return box_mean(gain, radius) * (2 * radius + 1) ** 2 > least
 
 
 def _spread(seen: Tensor, there: Tensor | None, kept: Tensor | None, unit: Tensor) -> Tensor:

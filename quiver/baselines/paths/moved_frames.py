@@ -66,20 +66,28 @@ def kept_noise(moved: Tensor) -> Tensor:
 
 
 def look(
-    frames: Tensor, path: Path, offsets: Sequence[int], scale: int = 1, size: tuple[int, int] | None = None
+    frames: Tensor,
+    path: Path,
+    offsets: Sequence[int],
+    scale: int = 1,
+    size: tuple[int, int] | None = None,
+    camera: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return frames [B, K, h, w] seen where paths [B, 2, C * h, w] lead after `offsets`, [B, K, C * h, w], bilinear,
     and 1 where that lies inside, else 0.
 
-    Inside are the first rows and columns, `size` of them, of frames that were filled; None: all.
+    Inside are the first rows and columns, `size` of them, of frames that were filled; None: all. A `camera` moves what
+    the paths reach: motion [B, K, 2, 3] of camera_motion.py.
     """
-    seen, inside, _ = _looked(frames, path, offsets, scale, size, noise=False)
+    seen, inside, _ = _looked(frames, path, offsets, scale, size, camera, noise=False)
     return seen, inside
 
 
-def look_with_noise(frames: Tensor, path: Path, offsets: Sequence[int], scale: int) -> tuple[Tensor, Tensor, Tensor]:
+def look_with_noise(
+    frames: Tensor, path: Path, offsets: Sequence[int], scale: int, camera: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return what `look` does, and the share of the noise's variance that is left there, [B, K, C * h, w]."""
-    seen, inside, kept = _looked(frames, path, offsets, scale, None, noise=True)
+    seen, inside, kept = _looked(frames, path, offsets, scale, None, camera, noise=True)
     assert kept is not None
     return seen, inside, kept
 
@@ -93,7 +101,13 @@ def look_still(frames: Tensor) -> Tensor:
 
 
 def _looked(
-    frames: Tensor, path: Path, offsets: Sequence[int], scale: int, size: tuple[int, int] | None, noise: bool
+    frames: Tensor,
+    path: Path,
+    offsets: Sequence[int],
+    scale: int,
+    size: tuple[int, int] | None,
+    camera: Tensor | None,
+    noise: bool,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     batch, count, height, width = frames.shape
     velocity, acceleration = (field.flip(1)[:, None] / scale for field in path)  # (right, down), as grids have it
@@ -108,9 +122,15 @@ def _looked(
         part = slice(start, start + step)
         place = velocity * times[0, part]
         place += acceleration * times[1, part]
-        if noise:
-            found[2].append(kept_noise(place))
-        place += first
+        if camera is None:
+            if noise:
+                found[2].append(kept_noise(place))
+            place += first
+        else:
+            place += first
+            place = _led(camera[:, part] / scale, place)
+            if noise:
+                found[2].append(kept_noise(place))
         found[1].append(_within(place[:, :, 0], last[1]).mul_(_within(place[:, :, 1], last[0])))
         grid = place.mul_(unit).sub_(1).flatten(0, 1).permute(0, 2, 3, 1)
         images = frames[:, part].reshape(-1, 1, height, width)
@@ -118,6 +138,23 @@ def _looked(
         found[0].append(seen.view(batch, -1, rows, width))
     seen, inside = (_joined(parts) for parts in found[:2])
     return seen, inside, _joined(found[2]) if noise else None
+
+
+def _led(camera: Tensor, place: Tensor) -> Tensor:
+    """Return where a camera's motion [B, K, 2, 3] in cells leads from places [B, K, 2, h, w] = (right, down).
+
+    Motion is by (1, y, x) from -1 to 1 across the frame: an affine map of the places.
+    """
+    height, width = place.shape[-2:]
+    right, down = place.unbind(2)
+    moved = []
+    for own, motion in ((right, camera[:, :, 1]), (down, camera[:, :, 0])):
+        shift = motion[..., 0] + motion[..., 1] * (1 / height - 1) + motion[..., 2] * (1 / width - 1)
+        of_down = motion[..., 1] * (2 / height)
+        of_right = motion[..., 2] * (2 / width)
+        led = own + shift[..., None, None]
+        moved.append(led.addcmul_(down, of_down[..., None, None]).addcmul_(right, of_right[..., None, None]))
+    return torch.stack(moved, dim=2)
 
 
 def _joined(parts: list[Tensor]) -> Tensor:

@@ -13,6 +13,7 @@ from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import path_merge as pm
 from quiver.baselines.domain_tables import domain_tables
 from quiver.baselines.information_domain import FLOOR, information_domain
+from quiver.baselines.paths.motion_paths import Moves
 
 EXPOSURE = 5e-4
 SENSOR = QIS(0.8, 1.6, 0.2, 3)
@@ -225,7 +226,8 @@ def test_what_lies_beyond_the_picture_has_no_weight(monkeypatch):
     """A side of 44 px is filled to 48: the four repeated columns counted as pixels of the picture."""
     velocity = torch.zeros(1, 2, 40, 48)
     velocity[:, 1] = 4.0
-    monkeypatch.setattr(pm, "paths", lambda *_: (velocity, torch.zeros_like(velocity)))
+    still = torch.zeros(1, 11, 2, 3)
+    monkeypatch.setattr(pm, "moves", lambda *_: Moves((velocity, torch.zeros_like(velocity)), still))
     codes = np.random.default_rng(0).integers(0, 8, (11, 40, 44)).astype(np.uint8)
     found = merged(codes, 5)
     column = np.arange(44)

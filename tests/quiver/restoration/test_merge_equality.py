@@ -15,7 +15,7 @@ from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import path_merge as pm
 from quiver.baselines.domain_tables import domain_tables, tables_of_batch
 from quiver.baselines.information_domain import information_domain
-from quiver.baselines.paths import moved_frames, path_search
+from quiver.baselines.paths import motion_paths, moved_frames, path_search
 from quiver.restoration.merge_inputs import inputs_of_windows, merge_inputs
 
 CPU = torch.device("cpu")
@@ -38,6 +38,12 @@ def plain_merge(codes, domain, t):
     return next(plain.stream(lambda i: codes[i], len(codes), domain, 11, range(t, t + 1)))
 
 
+@pytest.fixture
+def camera_at_rest(monkeypatch):
+    """The plain program knows no camera: tests/quiver/baselines/paths/ compare what moves with it."""
+    monkeypatch.setattr(motion_paths, "camera_motion", lambda p, offsets: torch.zeros(len(p[2]), len(offsets), 2, 3))
+
+
 def both(codes, offset, domain):
     """The merged frame and its inputs by the plain program, and by the one that is compared with it."""
     expected = plain_merge(codes, domain, offset)
@@ -46,6 +52,7 @@ def both(codes, offset, domain):
     return expected, one_frame(found), plain.merge_inputs(expected, domain), one_frame(inputs)
 
 
+@pytest.mark.usefixtures("camera_at_rest")
 @pytest.mark.parametrize("seed", range(24))
 def test_merged_frames_are_those_of_the_plain_program(seed):
     """Over bits, sensors, light, sizes, frames and places in time. Sums of eleven frames are rounded differently."""
@@ -137,7 +144,7 @@ def test_a_batch_takes_the_operators_of_a_window_and_waits_for_nothing(device):
     with Operators() as one_by_one:
         codes = np.zeros((11, 40, 48), np.uint8)
         plain_merge(codes, information_domain(quiver_physical(3.25), EXPOSURE), 5)
-    assert counts[0] < one_by_one.count / 5, (counts, one_by_one.count)
+    assert counts[0] < one_by_one.count / 3, (counts, one_by_one.count)  # which looks for no camera
 
 
 def test_the_count_of_operators_sees_what_waits():
