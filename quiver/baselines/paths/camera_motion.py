@@ -26,9 +26,7 @@ from torch import Tensor
 from quiver.baselines.paths.moved_frames import box_mean
 
 SCALE = 4  # px per cell, at which frames are registered
-DETAIL = (
-    4  # cells: structure that is wider than twice this does not count in a correlation; light that changes does not
-)
+DETAIL = 4  # cells: structure wider than twice this, as of light that changes, does not count in a correlation
 REACH = 4  # cells from where the last two frames lead, at which a shift is looked for
 STEPS = ((4, 1), (2, 3), (2, 3))  # of Gauss-Newton: scale; 1 for a shift, 3 for an affine motion
 MOST = 1.0  # cells, largest correction of one step
@@ -39,9 +37,7 @@ SMALLEST = 8  # cells of a frame's side, below which no camera is looked for
 def camera_motion(pyramid: dict[int, Tensor], offsets: Sequence[int]) -> Tensor:
     """Return the motion [B, K, 2, 3] of frames at each scale: {scale: [B, K, H/scale, W/scale]}.
 
-    `offsets` are the frames' places in time; 0 is the reference.
-
-    Zero for frames of fewer than SMALLEST cells.
+    `offsets` are the frames' places in time; 0 is the reference. Frames of fewer than SMALLEST cells have none.
     """
     frames = pyramid[SCALE]
     batch, count, height, width = frames.shape
@@ -67,7 +63,7 @@ def shifts(frames: Tensor, offsets: Sequence[int]) -> Tensor:
     total = frames[:, centre]
     inside = torch.ones_like(total)
     detail = frames - box_mean(frames, DETAIL)
-    spectra = torch.fft.rfft2(detail, s=(2 * height, 2 * width))
+    spectra = torch.fft.rfft2(detail, s=(2 * height, 2 * width))  # filled by zeros: shifts do not wrap around
     for distance in range(1, max(abs(offset) for offset in offsets) + 1):
         here = [offset for offset in (-distance, distance) if offset in offsets]
         guess = torch.stack([_led_to(found, offset) for offset in here], dim=1)
@@ -192,10 +188,12 @@ def _corrected(frames: Tensor, motion: Tensor, centre: int, scale: int, terms: i
     pull = (slope(mean[:, 0])[:, :, None] * places).flatten(1, 2).flatten(2)  # [B, 2 * terms, h w]
     share = vote.mean(1).flatten(1)[:, None]
     normal = (pull * share) @ pull.transpose(1, 2)
+    # a flat frame tells nothing of its motion, and must not divide by zero
     ridge = 1e-4 * normal.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] + 1e-9
     normal = normal + ridge * torch.eye(2 * terms, device=frames.device)
     right = pull @ errors.transpose(1, 2)  # [B, 2 * terms, K]
     step = -torch.linalg.solve_ex(normal, right)[0].transpose(1, 2).unflatten(2, (2, terms))
+    # the mean may be moved as a whole against the reference, which is to stay
     step = (step - step[:, centre, None]).clamp(-MOST, MOST) * scale
     return motion + functional.pad(step, (0, 3 - terms))
 

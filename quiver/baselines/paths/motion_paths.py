@@ -1,10 +1,12 @@
 """Estimates how every place of a frame moves through a window of noisy frames: one smooth path per place.
 
-    frames [B, K, H, W] at scales 8, 4, 2 (phi of pooled codes) ->
+    frames [B, K, H, W] at scales 8, 4, 2 (phi of pooled codes) -> the same without the shake of the camera
+    (camera_motion.py) ->
     fast paths: scale 8, every velocity up to SPEED is tried, all frames vote -> scale 4, those of neighbours are tried
     slow paths: scale 4, every velocity up to SLOW is tried
     both: Gauss-Newton of velocity v and acceleration a at scale 4, all frames at once -> the better one at scale 2 ->
-    Gauss-Newton at scale 2 -> no motion where it fits as well -> paths p + k v + k^2/2 a
+    Gauss-Newton at scale 2 -> no motion, or the smooth one of the camera, where it fits as well ->
+    paths p + k v + k^2/2 a
 
 Stripes of 16 px and finer textures vanish in cells of 8 px: only slow paths find them.
 
@@ -43,12 +45,12 @@ from quiver.baselines.paths.path_search import misfit, misfits_of, neighbours, s
 SPEED = 18.0  # px/frame, the fastest that is tried; refinement goes slightly beyond
 SLOW = 3.0  # px/frame, the fastest that is tried at scale 4
 STILL = (3, 60.0)  # radius of the block [cells of scale 2] over which a path must fit better than none, and by how much
+PAN = 10.0  # by how much a path must fit the same block better than the smooth motion of the camera
 GAIN = 120.0  # by how much a camera's motion must fit the frame better: sixty free numbers gain half of it from noise
 BLOCK = 8  # cells of scale 2: side of the blocks that vote on the camera's motion
 CERTAIN = 4.0  # of a motion's square in deviations of the noise, at which a block has half a vote
 AGREE = 0.3  # of the votes that are expected if all blocks move as the camera does
 SURE = 3.0  # deviations of the votes of blocks that know nothing
-PAN = 10.0  # the same by how much than the smooth motion of the camera
 DETAIL = (6, 40.0)  # radius of the block [cells of scale 2] over which slow paths must fit better, and by how much
 REFINE = ((4, 2, 2), (2, 4, 3))  # (scale, radius of the mean that is taken twice, in cells; iterations)
 CORRECTION = 1.0  # px/frame, expected size of a correction of v
@@ -68,9 +70,9 @@ class Moves:
 def moves(pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, deviation: Tensor) -> Moves:
     """Return how every place moves; arguments as of `paths`.
 
-    The motion of the camera is found first, and taken where the places that can tell it agree. What is smooth in time
-    of it is one more path for every place. The rest is shake, which counts where it fits better than none; paths are
-    found in the frames without it.
+    The motion of the camera is found first, and taken if the places that can tell it agree. What is smooth in time of
+    it is the path of every place that no other path fits better. The rest is shake, taken if it fits better than none;
+    paths are found in the frames without it.
     """
     fine = SCALES[-1]
     camera = camera_motion(pyramid, offsets)
