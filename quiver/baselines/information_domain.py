@@ -70,7 +70,7 @@ class InformationDomain:
 def information_domain(sensor: Sensor, exposure: float) -> InformationDomain:
     """Return the tables of a sensor for codes of `exposure` seconds; made once per sensor.
 
-    `ValueError` for a sensor whose mean code does not rise with light.
+    `ValueError` for a sensor whose mean code does not rise with light, and for a law that loses small probabilities.
     """
     table = sensor.response(exposure)
     root = np.sqrt(table.photons)
@@ -81,6 +81,13 @@ def information_domain(sensor: Sensor, exposure: float) -> InformationDomain:
         middle = ((root[1:] + root[:-1]) / 2) ** 2
         parts = pieces(middle, sensor.levels)
         information = np.concatenate([sensor.fisher_information(part, exposure) for part in parts])
+        lost = ~np.isfinite(information)
+        if lost.any():  # of a law of one's own, which takes small probabilities as differences of large ones
+            raise ValueError(
+                f"{type(sensor).__name__}: at {middle[lost][0]:.3g} photons log_pmf_of states a probability of 0 for a "
+                "code whose slope_of is not 0; keep the digits of small probabilities, or choose a method that needs "
+                "no information, as qbp-bm3d"
+            )
         # d light = 2 sqrt(light) d sqrt(light): the integrand stays finite at 0, where I may not
         steps = np.maximum(2 * np.sqrt(information * middle) * np.diff(root), LEAST)
     with np.errstate(over="ignore"):

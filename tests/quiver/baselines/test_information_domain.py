@@ -1,9 +1,14 @@
 """The scale phi: against integrals, closed forms and moments, for random sensors."""
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.special import gammaincc, gammaln, xlogy
 
+from qsim import Sensor
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
@@ -126,3 +131,32 @@ def test_tables_are_made_once():
     assert information_domain(BinarySPAD(0.5, 0.0, 2), EXPOSURE) is information_domain(
         BinarySPAD(0.5, 0.0, 2), EXPOSURE
     )
+
+
+@dataclass(frozen=True)
+class Staircase(Sensor):
+    """A law of one's own: how many of the thresholds 2, 5 and 9 electrons were reached, as differences of its cdf."""
+
+    bits: int = 2
+    code_model: ClassVar[str] = "multibit"
+    dark_rate: ClassVar[float] = 3.0
+    efficiency: ClassVar[float] = 0.5
+
+    def white(self, exposure):
+        return 18.0
+
+    def cdf_of(self, arrivals, exposure):
+        return np.stack([*(gammaincc(n, arrivals) for n in (2, 5, 9)), np.ones_like(arrivals)], axis=-1)
+
+    def log_pmf_of(self, arrivals, exposure, wanted=None):
+        with np.errstate(divide="ignore"):
+            return np.log(np.diff(self.cdf_of(arrivals, exposure), axis=-1, prepend=0.0))
+
+    def slope_of(self, arrivals, exposure):
+        slopes = [-np.exp(xlogy(n - 1, arrivals) - arrivals - gammaln(n)) for n in (2, 5, 9)]
+        return np.stack([*slopes, np.zeros_like(arrivals)], axis=-1)
+
+
+def test_a_law_that_loses_small_probabilities_is_named():
+    with pytest.raises(ValueError, match=r"Staircase: at .* photons log_pmf_of states a probability of 0"):
+        information_domain(Staircase(), EXPOSURE)
