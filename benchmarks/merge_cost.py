@@ -139,7 +139,11 @@ def page(found: dict[str, dict[str, list[float]]], threads: int, busy: bool) -> 
         before, after = (median(both[name]) for name in ("plain", "batches"))
         table.append((what, _shown(before), _shown(after), f"{before / after:.2f}"))
     text = result_page.head("What merging costs", "merge_cost.py", f" with {threads} thread{'s' * (threads > 1)}")
-    text += ["Medians of processor time, both programs in turn; the ratio is that of the medians.", ""]
+    text += [
+        "Medians of processor time, both programs in turn; the ratio is that of the medians. The plain program looks "
+        "for no camera.",
+        "",
+    ]
     text += [*markdown_table(table, ("what", "one by one [ms]", "in batches [ms]", "ratio")), ""]
     text += [f"Machine: {rows.machine()}.", "", *(["Measured beside other programs.", ""] if busy else [])]
     return "\n".join(text)
