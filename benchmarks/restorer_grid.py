@@ -16,15 +16,17 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import restorer_cells
 import result_page
+from restorer_cells import Place
 
 from qsim.figures import new_figure, write_figure
-from qsim.files import VERSION, read_json, write_bytes, write_json
+from qsim.files import read_json, write_bytes
 from qsim.streams.clip import Clip
 from qsim.tables import markdown_table
 from quiver.data.clips import open_clips, peak_of
@@ -32,8 +34,7 @@ from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
 from quiver.evaluation.breakdown import bin_names, by_motion, pooled, speeds
-from quiver.model.weights import digest
-from quiver.restoration.restorers import restorer, weights_path
+from quiver.restoration.restorers import restorer
 
 ROOT = Path(__file__).parents[1]
 FORMAT = "quiver-restorer-grid-1"
@@ -45,14 +46,6 @@ BITS = (1, 2, 3, 5, 7)
 LIGHTS = (0.5, 1.0, 3.25, 9.75, 26.0, 100.0)  # photons per pixel and code
 PLANES = {1: (0.3, 1.0, 3.0), 3: (1.0, 4.9, 15.0), 5: (5.0, 20.0, 60.0)}  # bits of a sum: light of its planes together
 FRAMES = 4  # of every clip, evenly spread; the window around each is complete
-
-
-@dataclass(frozen=True)
-class Place:
-    """One cell: its name, and the sensor and light."""
-
-    name: str
-    light: Illumination
 
 
 def places() -> list[Place]:
@@ -75,8 +68,10 @@ def main(words: list[str] | None = None) -> int:
             raise ValueError(f"{args.data}: no finished clip in split 'test'; finish `qsim generate`")
         args.out.mkdir(parents=True, exist_ok=True)
         for name in names:
-            grow(args.out / f"{name}.json", every[name], clips, args)
-        weights = digest(weights_path(args.restorer))
+            measure = partial(measured, light=every[name].light, args=args)
+            path = args.out / f"{name}.json"
+            restorer_cells.grow(path, clips, args.restorer, CLASSICAL, measure, format=FORMAT, frames=args.frames)
+        weights = restorer_cells.digest_of(args.restorer)
         known = [name for name in every if measured_with(args.out / f"{name}.json", weights)]
         write_tables(args.out, known, [clip.name for clip in clips])
     except (ValueError, OSError) as error:
@@ -105,32 +100,8 @@ def measured_with(path: Path, weights: str) -> bool:
     return found.get("weights") == weights and all("restorer" in clip for clip in clips)
 
 
-def grow(path: Path, place: Place, clips: Sequence[Clip], args: argparse.Namespace) -> None:
-    """Measure what a cell lacks, and write it after every clip. `ValueError` if it was measured otherwise."""
-    same = {"format": FORMAT, "quiver": VERSION, "frames": args.frames}
-    tried = {"restorer": args.restorer, "weights": digest(weights_path(args.restorer))}
-    found = read_json(path) if path.exists() else {**same, "name": place.name, "scores": {}}
-    changed = [key for key, value in same.items() if found.get(key) != value]
-    if changed:
-        raise ValueError(f"{path}: was measured with another {', '.join(changed)}; choose another --out, or remove it")
-    foreign = sorted(set(found["scores"]) - {clip.name for clip in clips})
-    if foreign:
-        raise ValueError(f"{path}: holds clips that {args.data} lacks, as {foreign[0]}; choose another --out")
-    if any(found.get(key) != value for key, value in tried.items()):
-        for rows in found["scores"].values():
-            rows.pop("restorer", None)
-        found |= tried
-    for clip in clips:
-        rows = found["scores"].setdefault(clip.name, {})
-        missing = [name for name in ("restorer", *CLASSICAL) if name not in rows]
-        if missing:
-            rows |= measured(clip, place.light, missing, args)
-            write_json(path, found)
-            print(f"{path}: {clip.name}", flush=True)
-
-
 def measured(
-    clip: Clip, light: Illumination, names: Sequence[str], args: argparse.Namespace
+    clip: Clip, names: Sequence[str], light: Illumination, args: argparse.Namespace
 ) -> dict[str, dict[str, Any] | None]:
     """Return for each method its matched PSNR [dB], and pixels and squared error of every bin of motion.
 

@@ -15,28 +15,29 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import restorer_cells
 import result_page
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
+from restorer_cells import RESTORER, Place
 from scipy.stats import t as student
 
 from qsim.colour import tone
-from qsim.files import VERSION, read_json, write_bytes, write_json
-from qsim.scenes.street import MOTIONS, SUBJECTS
+from qsim.files import write_bytes
+from qsim.scenes.street import motion_of, subject_of
 from qsim.streams.clip import Clip
 from qsim.tables import markdown_table
 from quiver.data.clips import open_clips, peak_of
 from quiver.data.codes import Codes, sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
-from quiver.model.weights import digest
-from quiver.restoration.automatic import chosen
-from quiver.restoration.restorers import restorer, weights_path
+from quiver.restoration.automatic import NETWORK, chosen
+from quiver.restoration.restorers import restorer
 
 ROOT = Path(__file__).parents[1]
 FORMAT = "quiver-restorer-street-1"
@@ -48,14 +49,6 @@ PICTURES = 3  # clips with the least lead, and with the largest
 PSNR = "psnr"
 
 Row = dict[str, float]
-
-
-@dataclass(frozen=True)
-class Place:
-    """One cell: its name, and the sensor and light."""
-
-    name: str
-    light: Illumination
 
 
 PLACES = tuple(
@@ -71,7 +64,7 @@ def main(words: list[str] | None = None) -> int:
         if not clips:
             raise ValueError(f"{args.data}: no finished clip in split 'test'; finish `qsim generate`")
         args.out.mkdir(parents=True, exist_ok=True)
-        cells = [grow(args.out / f"{place.name}.json", place, clips, args.restorer) for place in PLACES]
+        cells = [grown(args.out / f"{place.name}.json", place, clips, args.restorer) for place in PLACES]
         if args.pictures:
             write_pictures(args.out.with_suffix(".jpg"), cells, clips, args.restorer)
         write_page(args.out.with_suffix(".md"), cells)
@@ -95,32 +88,13 @@ def options() -> argparse.ArgumentParser:
 # ---- One cell
 
 
-def grow(path: Path, place: Place, clips: Sequence[Clip], weights: str) -> dict[str, Any]:
-    """Measure what a cell lacks, write it after every clip, return it. `ValueError` if it was measured otherwise."""
-    same = {"format": FORMAT, "quiver": VERSION, "frames": len(FRAMES)}
-    tried = {"restorer": weights, "weights": digest(weights_path(weights))}
-    found = read_json(path) if path.exists() else {**same, "name": place.name, "scores": {}}
-    changed = [key for key, value in same.items() if found.get(key) != value]
-    if changed:
-        raise ValueError(f"{path}: was measured with another {', '.join(changed)}; choose another --out, or remove it")
-    foreign = sorted(set(found["scores"]) - {clip.name for clip in clips})
-    if foreign:
-        raise ValueError(f"{path}: holds clips that the data set lacks, as {foreign[0]}; choose another --out")
-    if any(found.get(key) != value for key, value in tried.items()):
-        for rows in found["scores"].values():
-            rows.pop("restorer", None)
-        found |= tried
-    for clip in clips:
-        rows = found["scores"].setdefault(clip.name, {})
-        missing = [name for name in ("restorer", *CLASSICAL) if name not in rows]
-        if missing:
-            rows |= measured(clip, place.light, missing, weights)
-            write_json(path, found)
-            print(f"{path}: {clip.name}", flush=True)
-    return found
+def grown(path: Path, place: Place, clips: Sequence[Clip], weights: str) -> dict[str, Any]:
+    """Return a cell after what it lacked was measured; `ValueError` if it was measured otherwise."""
+    measure = partial(measured, light=place.light, weights=weights)
+    return restorer_cells.grow(path, clips, weights, CLASSICAL, measure, format=FORMAT, frames=len(FRAMES))
 
 
-def measured(clip: Clip, light: Illumination, names: Sequence[str], weights: str) -> dict[str, Any]:
+def measured(clip: Clip, names: Sequence[str], light: Illumination, weights: str) -> dict[str, Any]:
     """Return for each method its scores, and the method that `auto` chooses, by name."""
     codes, truth = sensed(clip, light, 0)
     peak = peak_of(truth.mean_light)
@@ -129,7 +103,7 @@ def measured(clip: Clip, light: Illumination, names: Sequence[str], weights: str
     valid = None if parts[0] is None else np.concatenate([part for part in parts if part is not None])
     found: dict[str, Any] = {}
     for name in names:
-        restored = restore(weights if name == "restorer" else name, codes) / peak
+        restored = restore(weights if name == RESTORER else name, codes) / peak
         score = metrics.score(restored, target, valid=valid)
         found[name] = {
             PSNR: score.psnr_matched,
@@ -137,7 +111,7 @@ def measured(clip: Clip, light: Illumination, names: Sequence[str], weights: str
             "scale": score.scale,
             "flicker": flicker(restored * score.scale, target),
         }
-    if "restorer" in names:
+    if RESTORER in names:
         found["auto"] = chosen("auto", codes)[0].name
     return found
 
@@ -157,7 +131,7 @@ def flicker(restored: NDArray[np.floating], target: NDArray[np.floating]) -> flo
 # ---- The page
 
 
-def lead(rows: dict[str, Any], method: str = "restorer") -> float:
+def lead(rows: dict[str, Any], method: str = RESTORER) -> float:
     """Return the PSNR of a method less that of the classical method that is best on this clip [dB]."""
     return float(rows[method][PSNR] - max(rows[name][PSNR] for name in CLASSICAL))
 
@@ -182,12 +156,12 @@ def seed_of(clip: str) -> int:
 
 def subject(clip: str) -> str:
     """Return what a clip shows."""
-    return SUBJECTS[seed_of(clip) % 10]
+    return subject_of(seed_of(clip))
 
 
 def motion(clip: str) -> str:
     """Return how the camera of a clip moves."""
-    return MOTIONS[seed_of(clip) // 10 % len(MOTIONS)]
+    return motion_of(seed_of(clip))
 
 
 def write_page(path: Path, cells: Sequence[dict[str, Any]]) -> None:
@@ -238,8 +212,8 @@ def headline(cells: Sequence[dict[str, Any]]) -> list[str]:
         mean, half = mean_with_interval(leads.values())
         worst = min(leads, key=lambda clip: leads[clip])
         best = best_of_all(scores)
-        over_one = [rows["restorer"][PSNR] - rows[best][PSNR] for rows in scores.values()]
-        auto = [lead(rows, "restorer" if rows["auto"] == "mergenet" else rows["auto"]) for rows in scores.values()]
+        over_one = [rows[RESTORER][PSNR] - rows[best][PSNR] for rows in scores.values()]
+        auto = [lead(rows, RESTORER if rows["auto"] == NETWORK else rows["auto"]) for rows in scores.values()]
         table.append(
             (
                 cell["name"],
@@ -260,7 +234,7 @@ def quality(cells: Sequence[dict[str, Any]]) -> list[str]:
     table = []
     for cell in cells:
         best = best_of_all(cell["scores"])
-        for name in ("restorer", best):
+        for name in (RESTORER, best):
             rows = [scores[name] for scores in cell["scores"].values()]
             table.append(
                 (

@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 import result_page
-from restorer_grid import FRAMES, Place, measured, places
+from restorer_cells import Place
+from restorer_grid import FRAMES, measured, places
 from rows import keep_apart, restorer_options
 
 from qsim.files import VERSION, read_json, write_bytes, write_json
@@ -112,7 +113,7 @@ def compared(place: Place, clips: list[Clip], args: argparse.Namespace, size: Si
     for clip in clips:
         for name, weights in (("shipped", START), ("tuned", str(run))):
             how = argparse.Namespace(restorer=weights, frames=size.frames)
-            row = measured(clip, light, ["restorer"], how)["restorer"]
+            row = measured(clip, ["restorer"], light, how)["restorer"]
             assert row is not None  # a network restores every stream
             scores[name].append(row["psnr"])
     return {"clips": [clip.name for clip in clips], "psnr": scores}

@@ -14,6 +14,7 @@ from clips import write_dataset
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
+import restorer_cells  # noqa: E402
 import restorer_grid  # noqa: E402  (docs are not a package)
 
 
@@ -99,9 +100,9 @@ def test_only_what_is_missing_is_measured(tmp_path, monkeypatch, capsys):
     calls: list[tuple[str, list[str]]] = []
     measured = restorer_grid.measured
 
-    def counted(clip, light, names, args):
+    def counted(clip, names, light, args):
         calls.append((clip.name, list(names)))
-        return measured(clip, light, names, args)
+        return measured(clip, names, light, args)
 
     monkeypatch.setattr(restorer_grid, "measured", counted)
     monkeypatch.setattr(restorer_grid, "CLASSICAL", ("naive",))
@@ -117,7 +118,7 @@ def test_only_what_is_missing_is_measured(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(restorer_grid, "CLASSICAL", ("naive", "moment:3"))
     assert restorer_grid.main(words) == 0
     assert [names for _, names in calls[2:]] == [["moment:3"]] * 2
-    monkeypatch.setattr(restorer_grid, "digest", lambda path: "1" * 64)
+    monkeypatch.setattr(restorer_cells, "digest", lambda path: "1" * 64)
     assert restorer_grid.main(words) == 0
     assert [names for _, names in calls[4:]] == [["restorer"]] * 2
     told = json.loads(path.read_text())

@@ -13,6 +13,7 @@ from clips import write_dataset
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
+import restorer_cells  # noqa: E402
 import restorer_street  # noqa: E402  (benchmarks are not a package)
 
 
@@ -87,7 +88,7 @@ def test_mistakes_are_one_sentence(tmp_path, monkeypatch, capsys, words, told):
 def test_only_what_is_missing_is_measured(tmp_path, monkeypatch, capsys):
     calls: list[list[str]] = []
 
-    def counted(clip, light, names, weights):
+    def counted(clip, names, light, weights):
         calls.append(list(names))
         return {name: row(21.0) for name in names} | {"auto": "mergenet"}
 
@@ -100,7 +101,7 @@ def test_only_what_is_missing_is_measured(tmp_path, monkeypatch, capsys):
     assert len(calls) == 2 * len(restorer_street.PLACES)
     assert restorer_street.main(words) == 0
     assert len(calls) == 2 * len(restorer_street.PLACES)
-    monkeypatch.setattr(restorer_street, "digest", lambda path: "1" * 64)
+    monkeypatch.setattr(restorer_cells, "digest", lambda path: "1" * 64)
     assert restorer_street.main(words) == 0
     assert calls[2 * len(restorer_street.PLACES) :] == [["restorer"]] * (2 * len(restorer_street.PLACES))
     path = tmp_path / "street" / "qis-3-3.25.json"
