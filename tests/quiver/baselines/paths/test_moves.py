@@ -47,6 +47,22 @@ def test_a_body_that_moves_before_a_scene_at_rest_is_no_camera(share):
     assert not moved(noisy(frames, 2.0, rng)[None]).shake.any()
 
 
+def test_hardly_any_scene_at_rest_is_taken_for_a_shaken_one():
+    """Bodies of up to half of the frame, any contrast, light that changes by up to 80 %: 2 of 120 other draws were."""
+    frames = []
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        rest = filmed(scenery(rng, SIDE, SIDE), torch.zeros(len(OFFSETS), 2, 3), SIDE, SIDE)
+        sliding = torch.zeros(len(OFFSETS), 2, 3)
+        sliding[:, :, 0] = torch.tensor(OFFSETS)[:, None] * torch.from_numpy(rng.uniform(-8, 8, 2).astype(np.float32))
+        body = filmed(scenery(rng, SIDE, SIDE, 64), sliding, SIDE, SIDE, 64)
+        edge = int(SIDE * rng.uniform(0.5, 1))
+        light = 1 + float(rng.choice([0.0, 0.4, -0.8])) * torch.tensor(OFFSETS)[:, None, None] / 10
+        seen = torch.cat([rest[:, :edge], body[:, edge:]], dim=1) + 3
+        frames.append(noisy(seen * light, float(np.exp(rng.uniform(-1.5, 2))), rng))
+    assert int(moved(torch.stack(frames)).shake.flatten(1).any(1).sum()) <= 2
+
+
 def test_paths_and_camera_add_up():
     """A frame seen along both is the reference: a body slides steadily while the camera shakes."""
     rng = np.random.default_rng(6)
