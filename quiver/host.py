@@ -75,6 +75,7 @@ def _mode() -> Callable[[], Any]:
 
     always = {torch.zeros, torch.ones, torch.empty, torch.rand, torch.randn, torch.linspace, torch.eye}
     by_numbers = {torch.full, torch.arange, torch.tensor, torch.as_tensor}
+    chosen = {torch.where, torch.Tensor.where}
 
     class Float32(TorchFunctionMode):
         """Tells functions that make tensors float32, and turns what others made of whole numbers into it."""
@@ -87,6 +88,8 @@ def _mode() -> Callable[[], Any]:
                 return func(*args, **kwargs)
             if func in always or (func in by_numbers and _has_float([*args, *kwargs.values()])):
                 return func(*args, **kwargs | {"dtype": torch.float32})
+            if func in chosen:  # its condition is no number: only the numbers to choose from get a type
+                return func(*map(_typed, args), **{name: _typed(value) for name, value in kwargs.items()})
             made = func(*args, **kwargs)
             default = torch.get_default_dtype()
             if not isinstance(made, torch.Tensor) or made.dtype is not default or not _of_whole_numbers(args, kwargs):
@@ -101,6 +104,10 @@ def _mode() -> Callable[[], Any]:
 
     def _as_float(value: Any) -> Any:
         return value.to(torch.float32) if isinstance(value, torch.Tensor) else value
+
+    def _typed(value: Any) -> Any:
+        """Return a Python float as a tensor of no dimensions, which gives way to the type of any tensor beside it."""
+        return torch.tensor(value, dtype=torch.float32) if isinstance(value, float) else value
 
     return Float32
 
