@@ -33,6 +33,7 @@ from torch.utils.data import DataLoader
 from qsim.files import VERSION, read_json, write_bytes, write_json
 from qsim.tables import markdown_table
 from quiver.baselines import path_merge
+from quiver.baselines.paths.motion_paths import Moves
 from quiver.data.clips import open_clips
 from quiver.data.illumination import Illumination
 from quiver.data.windows import Windows, WindowSettings
@@ -178,8 +179,8 @@ def draw(kind: str, split: str, args: argparse.Namespace, size: Size, folder: Pa
     settings = WindowSettings(crop=size.crop, lights=lights, seed=1 if split == "test" else 0, flips=False)
     windows = Windows(clips, settings, prepare=merge_training.prepare)
     count = len(clips) * len(lights) * size.test if split == "test" else size.windows
-    paths = still if kind == "still" else path_merge.paths
-    with mock.patch.object(path_merge, "paths", paths):
+    moves = still if kind == "still" else path_merge.moves
+    with mock.patch.object(path_merge, "moves", moves):
         loader = DataLoader(windows, batch_size=None, sampler=range(count), num_workers=args.workers)
         files: dict[str, Array] = {}
         for n, window in enumerate(loader):
@@ -192,10 +193,10 @@ def draw(kind: str, split: str, args: argparse.Namespace, size: Size, folder: Pa
                 print(f"{folder}: {n + 1} of {count} windows", flush=True)
 
 
-def still(pyramid: Any, offsets: Any, codes: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
-    """Return paths of no motion: `quiver.baselines.paths.motion_paths.paths` otherwise."""
+def still(pyramid: Any, offsets: Any, codes: Tensor, deviation: Tensor) -> Moves:
+    """Return that nothing moves: `quiver.baselines.paths.motion_paths.moves` otherwise."""
     nothing = torch.zeros(len(codes), 2, *(2 * side for side in codes.shape[2:]))
-    return nothing, nothing
+    return Moves((nothing, nothing), torch.zeros(*codes.shape[:2], 2, 3))
 
 
 def kept(window: dict[str, Any]) -> dict[str, Array]:
