@@ -13,6 +13,8 @@ import threading
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
+from qsim.backend import choose, on_gpu
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -29,6 +31,24 @@ def one_thread_at_a_time(function: Callable[P, T]) -> Callable[P, T]:
                 return function(*arguments, **options)
             finally:
                 _finish_kernels()
+
+    return alone
+
+
+def one_thread_in_order(function: Callable[P, T]) -> Callable[P, T]:
+    """Return the function under the same lock; where kernels run on a GPU, they may go on after it.
+
+    All threads share one queue of the GPU, so kernels of the next thread begin behind them.
+    """
+
+    @functools.wraps(function)
+    def alone(*arguments: P.args, **options: P.kwargs) -> T:
+        with _locks[0]:
+            try:
+                return function(*arguments, **options)
+            finally:
+                if not on_gpu(choose().backend):
+                    _finish_kernels()
 
     return alone
 

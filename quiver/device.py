@@ -68,6 +68,17 @@ def wait(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
+def follow(device: torch.device) -> None:
+    """Let the work of another library, in a queue of its own, begin behind what torch has started on a GPU.
+
+    The host does not wait. Such queues follow torch's default stream, so that stream follows the current one.
+    """
+    import torch
+
+    if is_gpu(device):
+        torch.cuda.default_stream(device).wait_stream(torch.cuda.current_stream(device))
+
+
 def random_states() -> list[Tensor]:
     """Return the states of the random generators of all GPUs; without one an empty list."""
     import torch

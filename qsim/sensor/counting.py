@@ -47,6 +47,7 @@ class CountingSPAD(SPAD):
     code_model: ClassVar[str] = "counting"
     takes_slices: ClassVar[bool] = True
     follows_photons: ClassVar[bool] = True
+    tabulated: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

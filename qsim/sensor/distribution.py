@@ -46,6 +46,7 @@ class Distribution(ABC):
 
     bits: int  # of a code, 1 ... 16
     code_model: ClassVar[str]  # kind of code: "multibit" read, "binary_sum" of planes, "counting"
+    law_follows_exposure: ClassVar[bool] = True  # F_k depends on the exposure, too, and not on arrivals alone
 
     @property
     @abstractmethod

@@ -72,6 +72,8 @@ class QIS(Sensor):
     code_model: ClassVar[str] = "multibit"
     takes_slices: ClassVar[bool] = True
     has_read_out: ClassVar[bool] = True
+    tabulated: ClassVar[bool] = True
+    law_follows_exposure: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         require_number(self, "quantum_efficiency", 0, 1, open_low=True)

@@ -54,6 +54,7 @@ class Sensor(Distribution):
     follows_photons: ClassVar[bool] = False  # its photons can be followed one by one: dead time links them
     keeps_charge: ClassVar[bool] = False  # a plane depends on those before it
     has_read_out: ClassVar[bool] = False  # electrons are read with gain, offset and noise
+    tabulated: ClassVar[bool] = False  # one number against F_k is a code, or a plane of one: a table can hold the law
 
     @property
     def plane(self) -> Sensor:

@@ -71,6 +71,8 @@ class BinarySPAD(SPAD):
 
     code_model: ClassVar[str] = "binary_sum"
     sums_planes: ClassVar[bool] = True
+    tabulated: ClassVar[bool] = True
+    law_follows_exposure: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -83,6 +83,11 @@ def _code_table(sensor: Sensor, exposure: float) -> CodeTable | None:
         return None
 
 
+def draws_at_once(sensor: Sensor) -> bool:
+    """Return whether `draw_codes` draws a sum of planes from one number per pixel (`Row.at_once`)."""
+    return sensor.bits <= TABLE_BITS
+
+
 def draw_codes(sensor: Sensor, photons: Array, exposure: float, key: Key, origin: tuple[int, int] = (0, 0)) -> Array:
     """Return codes [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`, without Dr.Jit.
 

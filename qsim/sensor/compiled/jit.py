@@ -17,6 +17,7 @@ from qsim.device_lock import one_thread_at_a_time
 from qsim.keys import KEY_STEPS, MULTIPLIERS, ROUNDS
 from qsim.thread_warnings import warnings_here
 
+ALIGNED = 64  # bytes
 _PACKET = 16  # numbers that a kernel works on at a time, at most
 _INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
 
@@ -68,6 +69,26 @@ def whole_packets(numbers: Array) -> Array:
     return np.append(numbers, np.zeros(missing, numbers.dtype))[: numbers.size] if missing else numbers
 
 
+def aligned(shape: tuple[int, ...], kind: Any) -> Array:
+    """Return an empty array whose memory begins where Dr.Jit's own would.
+
+    Kernels for other memory are other kernels: without this one would be compiled again by chance.
+    """
+    size = int(np.prod(shape)) * np.dtype(kind).itemsize
+    memory = np.empty(size + ALIGNED, np.uint8)
+    first = -memory.ctypes.data % ALIGNED
+    return memory[first : first + size].view(kind).reshape(shape)
+
+
+def in_aligned(numbers: Array) -> Array:
+    """Return the same numbers in memory as of `aligned`; without a copy where they are there."""
+    if numbers.ctypes.data % ALIGNED == 0 and numbers.flags.c_contiguous:
+        return numbers
+    found = aligned(numbers.shape, numbers.dtype)
+    found[...] = numbers
+    return found
+
+
 # ---- Pieces of kernels
 
 
@@ -99,15 +120,15 @@ def smaller(a: Any, b: Any) -> Any:
     return dr.select(a < b, a, b)
 
 
-def philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
-    """Return the four words of one block; the compiled equivalent of keys.philox4x32 at redraw 0."""
+def philox(x: Any, y: Any, frame: Any, high: Any, low: Any, redraw: int = 0) -> list[Any]:
+    """Return the four words of one block; the compiled equivalent of keys.philox4x32."""
     import drjit as dr
 
     u32 = type(x)
     c0 = x
     c1 = y
     c2 = frame
-    c3 = u32(0)
+    c3 = u32(redraw)
     for _ in range(ROUNDS):
         a = u32(MULTIPLIERS[0])
         b = u32(MULTIPLIERS[1])

@@ -1,0 +1,243 @@
+"""Draws the codes of a batch in one launch: every row has its own law, light, key, frame and place in the full frame.
+
+    light [B, T, H, W] + a record per row -> one thread per four pixels of a row of pixels -> four codes, a byte each
+
+Nothing of a draw is a constant of the kernel: sizes, keys, exposures and tables are arguments. It is compiled once for
+each number of bits and type of light. A pixel that the cubics of law_table.py leave undecided is decided by the same
+thread in float64 with two words, as the reference does. So no pixel goes to the host, and no host waits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+from functools import cache, lru_cache
+from typing import Any
+
+import numpy as np
+
+from qsim.sensor.compiled.jit import aligned, backend, philox, smaller, uniform32
+from qsim.sensor.compiled.law_table import NODES
+
+LIGHT = {"f16": "Float16", "f": "Float", "f64": "Float64"}  # Dr.Jit's types of light
+RECORD = 12  # numbers of a record
+
+
+@dataclass(frozen=True)
+class Record:
+    """What a kernel knows of a row, in the order in which it reads it."""
+
+    efficiency: float  # arrivals per unit of light
+    dark: float  # arrivals without light
+    rate: float  # of its law's table
+    margin: float
+    first: int  # cell of its law in all tables
+    last: int  # cell of its law, counted from its first one
+    frame: int  # of its first frame
+    planes: int  # summed into a code, each with its own number
+    y: int  # of its first pixel in the full frame
+    x: int
+    key: int  # of 64 bits
+
+    def numbers(self) -> list[float]:
+        """Return the RECORD numbers that a kernel reads."""
+        *others, key = astuple(self)
+        return [*map(float, others), float(key >> 32), float(key & 0xFFFFFFFF)]
+
+
+@lru_cache(maxsize=2)  # of one loader: full batches, and the last one
+def places(shape: tuple[int, int, int, int]) -> list[Any]:
+    """Return the place of each thread of a batch [B, T, H, W] as arguments: an index, how to take it apart, and sizes.
+
+    An index holds row, frame, row of pixels and column in the bits of one number. Reading it is cheaper than divisions.
+    """
+    import drjit as dr
+
+    u32 = backend().UInt32
+    rows, frames, height, width = shape
+    threads = -(-width // 4)
+    sides = (rows, frames, height, threads)
+    below_y = (threads - 1).bit_length()
+    below_t = below_y + (height - 1).bit_length()
+    below_row = below_t + (frames - 1).bit_length()
+    index = aligned(sides, np.uint32)
+    index[...] = 0
+    for axis, (side, below) in enumerate(zip(sides, (below_row, below_t, below_y, 0), strict=True)):
+        numbers = np.arange(side, dtype=np.uint32) << np.uint32(below)
+        index |= numbers.reshape([-1 if n == axis else 1 for n in range(4)])
+    masks = [(1 << (bits - low)) - 1 for low, bits in ((0, below_y), (below_y, below_t), (below_t, below_row))]
+    scalars = (below_y, below_t, below_row, *masks, frames, height, width)
+    return [u32(index.reshape(-1)), *(dr.opaque(u32, number) for number in scalars)]
+
+
+@cache
+def kernel(bits: int, light: str, summing: bool, shifted: bool, whole: bool) -> Callable[..., Any]:
+    """Return the kernel of codes of so many bits: `places`, light, records, tables -> Int32, four codes each.
+
+    `light` is a name of LIGHT. `summing`: codes of some rows are sums of planes. `shifted`: some rows do not begin at a
+    multiple of four columns of the full frame. `whole`: rows of pixels have a multiple of four pixels, and the memory
+    of the light begins at a multiple of four numbers.
+    """
+    import drjit as dr
+
+    jit = backend()
+    u32 = jit.UInt32
+
+    def draw(place: list[Any], given: Any, rows: Any, fast: Any, exact: Any) -> Any:
+        index, below_y, below_t, below_row, mask_x, mask_y, mask_t, frames, height, width = place
+        row = index >> below_row
+        t = (index >> below_t) & mask_t
+        line = (index >> below_y) & mask_y
+        column = index & mask_x
+        law, counts, seed = (dr.gather(jit.Array4f64, rows, row * (RECORD // 4) + n) for n in range(3))
+        first, last, frame, planes = (u32(number) for number in counts)
+        y, x, high, low = (u32(number) for number in seed)
+        if whole:
+            four = getattr(jit, f"Array4{light}")
+            photons = list(dr.gather(four, given, dr.arange(u32, dr.width(index))))
+        else:
+            one = getattr(jit, LIGHT[light])
+            at = ((row * frames + t) * height + line) * width + 4 * column
+            photons = [dr.gather(one, given, at + n, 4 * column + n < width) for n in range(4)]
+        cells = [_Cell.of(jit.Float64(value), law, first, last, bits) for value in photons]
+        words = _Words(x, column, y + line, high, low, shifted)
+        frame += t
+
+        def plane(counter: Any) -> Any:
+            """Return the codes of one frame, or of one plane of it."""
+            now = words.at(counter)
+            codes, near = _codes(cells, [uniform32(word) for word in now], fast, _Cell.fast)
+
+            def decided(_: Any) -> tuple[Any]:
+                both = zip(now, words.at(counter, redraw=1), strict=True)
+                return (_codes(cells, [_uniform64(*pair) for pair in both], exact, _Cell.exact)[0],)
+
+            open_ = near < jit.Float(law[3])
+            return dr.if_stmt((codes,), open_, decided, lambda codes: (codes,), mode="symbolic")[0]
+
+        return jit.Int32(_summed(plane, frame, planes) if summing else plane(frame))
+
+    return dr.freeze(draw, warn_after=1000)
+
+
+def _summed(plane: Callable[[Any], Any], frame: Any, planes: Any) -> Any:
+    """Return the sum of the codes of all planes of a frame; each fits its byte, as codes have at most 8 bits."""
+    import drjit as dr
+
+    u32 = type(frame)
+    _, total = dr.while_loop(
+        (u32(0), u32(0)),
+        lambda number, _: number < planes,
+        lambda number, total: (number + 1, total + plane(frame * planes + number)),
+        mode="symbolic",
+    )
+    return total
+
+
+def _codes(cells: list[_Cell], numbers: list[Any], table: Any, step: Callable[..., Any]) -> tuple[Any, Any]:
+    """Return how many steps each uniform number has passed, four in one, and the distance to the nearest step.
+
+    `step` returns F of a step of a cell. The steps just before and behind a number are both on the way.
+    """
+    import drjit as dr
+
+    u32 = backend().UInt32
+    joined = u32(0)
+    near = type(numbers[0])(1)
+    for n, (cell, u) in enumerate(zip(cells, numbers, strict=True)):
+        code = u32(0)
+        for half in (1 << bit for bit in reversed(range(cell.bits))):
+            distance = u - step(cell, table, code + (half - 1))
+            near = smaller(near, dr.abs(distance))
+            code += dr.select(distance >= 0, u32(half), u32(0))
+        joined |= code << (8 * n)
+    return joined, near
+
+
+def _uniform64(word: Any, further: Any) -> Any:
+    """Return the number of two words; the compiled equivalent of `keys.uniform`."""
+    double = backend().Float64
+    return (double(word) + (double(further) + 0.5) * 2.0**-32) * 2.0**-32
+
+
+@dataclass(frozen=True)
+class _Words:
+    """The random words of four neighbours, of which the first need not begin a block."""
+
+    x: Any  # column of the row's first pixel in the full frame
+    column: Any  # of these four, in fours
+    y: Any
+    high: Any
+    low: Any
+    shifted: bool
+
+    def at(self, counter: Any, redraw: int = 0) -> list[Any]:
+        """Return four words of a frame or plane."""
+        import drjit as dr
+
+        block = (self.x >> 2) + self.column
+        found = philox(block, self.y, counter, self.high, self.low, redraw)
+        if not self.shifted:
+            return found
+        found += philox(block + 1, self.y, counter, self.high, self.low, redraw)
+        for step in (1, 2):
+            moved = (self.x & step) != 0
+            found = [dr.select(moved, found[n + step], found[n]) for n in range(len(found) - step)]
+        return found[:4]
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """The cell of one pixel in its law's table, and the place in it."""
+
+    bits: int
+    place: Any  # of the cell's first step in all tables
+    share: Any  # float32, from -1 to 1 in the cell
+    cell: Any
+    arrivals: Any
+    rate: Any
+
+    @classmethod
+    def of(cls, light: Any, law: Any, first: Any, last: Any, bits: int) -> _Cell:
+        """Return the cell of light; `law` has efficiency, dark, rate and margin of its row."""
+        import drjit as dr
+
+        jit = backend()
+        arrivals = dr.fma(light, law[0], law[1])
+        # A root of float32 and its correction: the root of float64 takes several times as long.
+        high = jit.Float(arrivals)
+        low = jit.Float(arrivals - jit.Float64(high))
+        root = dr.maximum(dr.sqrt(high), 1e-30)
+        rate = jit.Float(law[2])
+        more = (dr.fma(-root, root, high) + low) * dr.rcp(root) * (0.5 * rate)
+        at = root * rate
+        # Light beyond the last cell, and what is no number, is in the last one.
+        most = jit.Float(last)
+        cell = jit.UInt32(dr.select(at < most, at, most))
+        share = dr.fma(at - jit.Float(cell) + more, 2, -1)
+        return cls(bits, (first + cell) * ((1 << bits) - 1), share, cell, arrivals, law[2])
+
+    def fast(self, table: Any, step: Any) -> Any:
+        """Return F of a step in float32."""
+        import drjit as dr
+
+        return _polynomial(list(dr.gather(backend().Array4f, table, self.place + step)), self.share)
+
+    def exact(self, table: Any, step: Any) -> Any:
+        """Return F of a step in float64."""
+        import drjit as dr
+
+        jit = backend()
+        share = dr.fma(dr.sqrt(self.arrivals) * self.rate - jit.Float64(self.cell), 2, -1)
+        at = (self.place + step) * (NODES // 4)
+        return _polynomial([term for n in range(NODES // 4) for term in dr.gather(jit.Array4f64, table, at + n)], share)
+
+
+def _polynomial(terms: list[Any], x: Any) -> Any:
+    """Return the value of a polynomial, of whose coefficients the constant one comes first."""
+    import drjit as dr
+
+    *others, value = terms
+    for term in reversed(others):
+        value = dr.fma(value, x, term)
+    return value

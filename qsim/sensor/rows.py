@@ -1,0 +1,60 @@
+"""Draws the codes of a batch of windows in one launch, on the device; each row has its own sensor, key and exposure.
+
+    light [B, T, H, W] on the device, and a Row for each of the B -> compiled/rows_kernel.py -> codes on the device
+
+The codes are those of `Sensor.sample`. No code goes to the host, and a GPU is not waited for. Another key, clip, frame,
+exposure, light level or size compiles nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite, prod
+from typing import Any
+
+import numpy as np
+
+from qsim.device_lock import one_thread_in_order
+from qsim.keys import require_counters
+from qsim.sensor.distribution import check_exposure
+from qsim.sensor.row import Row
+from qsim.sensor.sensor import fast_engine_works
+
+LIGHT = {"float16": "f16", "float32": "f", "float64": "f64"}  # types of light, and their names in Dr.Jit
+LARGEST = 1 << 31  # numbers of a batch
+
+
+@one_thread_in_order
+def draw_rows(light: Any, shape: tuple[int, int, int, int], rows: Sequence[Row], *, aligned: bool = False) -> Any:
+    """Return codes as Dr.Jit's Int32 [B T H ceil(W / 4)] on the device: four in a number, the first one lowest.
+
+    `light` holds the B T H W numbers of `shape` in a line, float16, float32 or float64: a NumPy array, or one of a
+    library that knows DLPack, which stays on its device. `aligned`: memory of the other library begins at a multiple
+    of 64 bytes; other memory may need a kernel of its own. Light is finite and not negative: nobody looks at it, and
+    codes of other light have no meaning.
+    `ValueError` for rows that do not fit the shape, for a sensor whose law no table holds, and for a machine without a
+    compiled engine.
+    """
+    kind = LIGHT.get(str(light.dtype).rpartition(".")[2])
+    if len(shape) != 4 or not 0 < prod(shape) <= LARGEST or tuple(light.shape) != (prod(shape),) or kind is None:
+        wanted = "light has the shape [B, T, H, W] in float16, float32 or float64, 1 to 2^31 numbers"
+        raise ValueError(f"{wanted}; got {list(shape)} in {light.dtype}")
+    if len(rows) != shape[0]:
+        raise ValueError(f"light has {shape[0]} rows, and {len(rows)} are described; give one Row for each")
+    for row in rows:
+        check_exposure(row.exposure)
+        require_counters(row.key, shape[1:], row.origin, 1 if row.at_once else row.sensor.counters)
+        if not (isfinite(row.scale) and row.scale >= 0):
+            raise ValueError(f"Row.scale is finite and not negative, got {row.scale!r}")
+    if fast_engine_works():
+        from qsim.sensor.compiled import draw_rows as compiled
+        from qsim.sensor.compiled import jit
+
+        missing = [row.sensor for row in rows if compiled.law_of(row) is None]
+        if missing:
+            raise ValueError(f"{missing[0]!r}: no table holds the law of its codes; use `sample`")
+        if jit.available():
+            if isinstance(light, np.ndarray):
+                return compiled.draw(jit.in_aligned(light), kind, True, shape, rows)
+            return compiled.draw(light, kind, aligned, shape, rows)
+    raise ValueError("no compiled engine draws codes on this machine; use `sample`")
