@@ -35,13 +35,14 @@ from quiver.baselines.domain_tables import DomainTables, domain_tables
 from quiver.baselines.information_domain import InformationDomain, information_domain
 from quiver.baselines.paths.motion_paths import Moves, moves
 from quiver.baselines.paths.moved_frames import CHUNK, SCALES, box_mean, enlarged, halved, look
-from quiver.baselines.sliding_window import check_window, checked_codes, in_units, look_ahead
+from quiver.baselines.sliding_window import check_window, checked_codes, equal_windows, in_units
 from quiver.device import is_gpu
 
 # (cells of 2 x 2 px beside the own one whose mean difference is squared, and over which squares are averaged; statistic
 # up to which frames agree; excess over it at which a frame has half its weight)
 STATISTICS = ((1, 1, 3.0, 1.0), (0, 2, 1.6, 0.25))
 GROUPS = ((-1,), (1,), (-2, -3), (2, 3), (-4, -5), (4, 5))  # offsets of the frames that `Merged.groups` averages
+PIXEL_BYTES = 3_000  # that a pixel of a window takes on a GPU, where all frames and velocities are tried at a time
 NEAR = 2  # groups of one frame beside the reference; the other frames are compared with the mean of these three
 
 
@@ -85,10 +86,18 @@ def prepared(codes: Tensor, tables: DomainTables) -> Prepared:
     return Prepared(frames, pyramid, (height, width))
 
 
-def window_of(frames: Sequence[Prepared]) -> Prepared:
-    """Return one window of frames that were prepared one by one, [1, 1, H, W] each."""
-    pyramid = {scale: torch.cat([frame.pyramid[scale] for frame in frames], dim=1) for scale in SCALES}
-    return Prepared(torch.cat([frame.codes for frame in frames], dim=1), pyramid, frames[0].size)
+def windows_of(frames: Sequence[Prepared], count: int) -> Prepared:
+    """Return all windows of `count` successive frames, of frames that were prepared one by one, [1, 1, H, W] each."""
+    pyramid = {scale: _windows([frame.pyramid[scale] for frame in frames], count) for scale in SCALES}
+    return Prepared(_windows([frame.codes for frame in frames], count), pyramid, frames[0].size)
+
+
+def _windows(images: Sequence[Tensor], count: int) -> Tensor:
+    """Return windows [B, count, H, W] of successive images [1, 1, H, W]."""
+    joined = torch.cat(list(images), dim=1)
+    if len(images) == count:
+        return joined
+    return joined[0].unfold(0, count, 1).movedim(-1, 1)
 
 
 @torch.no_grad()
@@ -197,32 +206,36 @@ def agreement(difference: Tensor, variance: Tensor) -> Tensor:
 
 
 def stream(
-    read: Callable[[int], Array],
+    read: Callable[[int], Array | Tensor],
     length: int,
     domain: InformationDomain,
     window: int,
     frames: range,
     device: torch.device | str = "cpu",
+    *,
+    together: int = 1,
 ) -> Iterator[Merged]:
-    """Yield merged frames [1, H, W] of a stream of `length` frames, each after look_ahead(window) more were read.
+    """Yield merged frames [B, H, W] of a stream of `length` frames, each after look_ahead(window) more were read.
 
     `read` returns the codes [H, W] of one frame. A frame is read and pooled once; windows end where the stream ends.
+    Up to `together` successive frames are merged at a time, those near the ends of the stream alone.
     """
     device = torch.device(device)
     tables = domain_tables(domain, device)
     kept: deque[tuple[int, Prepared]] = deque()
-    for t in frames:
-        first = max(0, t - window // 2)
-        last = min(length - 1, t + look_ahead(window))
+    for part, before, count in equal_windows(frames, window, length, together):
+        first = part.start - before
         while kept and kept[0][0] < first:
             kept.popleft()
-        for i in range(kept[-1][0] + 1 if kept else first, last + 1):
+        for i in range(kept[-1][0] + 1 if kept else first, part.stop - 1 - before + count):
             kept.append((i, prepared(as_codes(read(i)[None, None], device), tables)))
-        yield merge(window_of([frame for _, frame in kept]), [i - t for i, _ in kept], tables)
+        yield merge(windows_of([frame for _, frame in kept], count), range(-before, count - before), tables)
 
 
-def as_codes(codes: Array, device: torch.device) -> Tensor:
-    """Return codes of NumPy on a device, in few bytes until they are there."""
+def as_codes(codes: Array | Tensor, device: torch.device) -> Tensor:
+    """Return codes on a device; those of NumPy in few bytes until they are there."""
+    if isinstance(codes, Tensor):
+        return codes.to(device)
     small = codes if codes.dtype == np.uint8 else codes.astype(np.float32)
     return torch.from_numpy(np.ascontiguousarray(small)).to(device, non_blocking=True)
 

@@ -9,7 +9,7 @@ last are reflections that do not repeat the end frame (-1 is frame 1), several t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 
 import numpy as np
 from numpy import ndarray as Array
@@ -63,6 +63,27 @@ def window_frames(frame: int, window: int, length: int) -> Array:
 def existing_frames(frame: int, window: int, length: int) -> slice:
     """Return the frames of the window around `frame` that a clip of `length` frames has."""
     return slice(max(0, frame - window // 2), min(length, frame + look_ahead(window) + 1))
+
+
+def alike(keys: Sequence[Hashable], frames: range, most: int) -> Iterator[range]:
+    """Yield successive frames of equal keys, at most `most` at a time; `keys` has one of each frame."""
+    first = 0
+    for i in range(1, len(keys) + 1):
+        if i == len(keys) or keys[i] != keys[first] or i - first == most:
+            yield range(frames.start + first, frames.start + i)
+            first = i
+
+
+def equal_windows(frames: range, window: int, length: int, most: int) -> Iterator[tuple[range, int, int]]:
+    """Yield successive frames whose windows have the same frames beside them, at most `most` at a time; how many frames
+    of such a window come before its own, and how many it has in all.
+    """
+    shapes = []
+    for frame in frames:
+        here = existing_frames(frame, window, length)
+        shapes.append((frame - here.start, here.stop - here.start))
+    for part in alike(shapes, frames, most):
+        yield part, *shapes[part.start - frames.start]
 
 
 def frame_times(frame: int, window: int, length: int) -> tuple[int, ...]:

@@ -113,7 +113,7 @@ def wrap_network(
     identity = {"weights_sha256": weights_sha256, "mode": mode, "precision": options.precision}
 
     def cut(height: int, width: int) -> str:
-        return cut_pieces(model, height, width, options.bound(host=isinstance(model, MergeNet))).text
+        return cut_pieces(model, height, width, options.bound()).text
 
     return Restorer(
         name,

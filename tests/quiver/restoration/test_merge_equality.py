@@ -4,11 +4,9 @@ import merge_reference as plain
 import numpy as np
 import pytest
 import torch
-from merge_windows import EXPOSURE, one_frame, random_sensor
-from scipy.ndimage import gaussian_filter
-from torch.utils._python_dispatch import TorchDispatchMode
+from merge_windows import EXPOSURE, one_frame, random_sensor, window_of
+from operators import Operators
 
-from qsim.keys import Key
 from qsim.sensor.devices import quiver_physical
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
@@ -19,18 +17,6 @@ from quiver.baselines.paths import motion_paths, moved_frames, path_search
 from quiver.restoration.merge_inputs import inputs_of_windows, merge_inputs
 
 CPU = torch.device("cpu")
-
-
-def window_of(rng, sensor, shape):
-    """Codes of a texture that moves by up to 12 px/frame, at 0.1 to 200 photons, with hot pixels or without."""
-    frames, height, width = shape
-    texture = gaussian_filter(rng.normal(size=(height + 40, width + 40)), rng.uniform(0.5, 4), mode="wrap")
-    light = 10 ** rng.uniform(-1, 2.3) * np.exp(texture / texture.std() * rng.uniform(0.1, 1.2))
-    speed = rng.uniform(-12, 12, 2) * rng.choice([0.0, 0.1, 1.0])
-    moved = [np.roll(light, tuple(int(s) for s in np.round(speed * t)), (0, 1)) for t in range(frames)]
-    photons = np.stack(moved)[:, :height, :width]
-    photons = photons + 50 * (rng.random((height, width)) < rng.choice([0, 0.01]))
-    return sensor.sample(photons, EXPOSURE, key=Key(0, int(rng.integers(10**6))), engine="reference")
 
 
 def plain_merge(codes, domain, t):
@@ -106,26 +92,6 @@ def test_windows_of_a_batch_are_merged_as_if_alone():
         alone = inputs_of_windows(window[None], domain_tables(domain, CPU))
         assert together.channels[i] == pytest.approx(alone.channels[0], abs=1e-5)
         assert together.phi[i] == pytest.approx(alone.phi[0], abs=1e-5)
-
-
-class Operators(TorchDispatchMode):
-    """Counts what is asked of a device, and keeps the names of what waits for it or copies to it."""
-
-    WAITS = ("_local_scalar_dense", "nonzero", "item", "is_nonzero", "equal", "masked_select", "unique")
-
-    def __init__(self):
-        super().__init__()
-        self.count = 0
-        self.waits = []
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += not func.is_view
-        name = func.name().removeprefix("aten::").partition(".")[0]
-        devices = {x.device.type for x in args if isinstance(x, torch.Tensor) and x.ndim}
-        devices |= {str(x) for x in (kwargs or {}).values() if isinstance(x, torch.device)}
-        if name in self.WAITS or len(devices) > 1:
-            self.waits.append(name)
-        return func(*args, **(kwargs or {}))
 
 
 @pytest.mark.parametrize("device", ["cpu", "meta"])

@@ -17,6 +17,7 @@ from quiver.baselines import path_merge
 from quiver.baselines.information_domain import information_domain
 from quiver.data.codes import array_codes
 from quiver.model.mergenet import MergeNet, MergeNetConfig
+from quiver.restoration import merging
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import wrap_network
 from quiver.restoration.pieces import cut_pieces
@@ -43,6 +44,26 @@ def test_without_a_correction_it_is_the_merge():
     codes, array = stream((4, 16, 24))
     expected = path_merge.restore(array, SENSOR, EXPOSURE)
     assert method(trained=False).restore(codes) == pytest.approx(expected, rel=2e-2, abs=2e-3)  # tables of phi, caps
+
+
+@pytest.mark.parametrize(("memory", "most"), [(10**9, 6), (6 * 10**6, 2), (3 * 10**6, 1)])
+def test_on_a_gpu_frames_are_restored_together(memory, most, monkeypatch):
+    """The CPU takes the place of the GPU: as many frames as the memory holds, and the same photons."""
+    codes, _ = stream((16, 24, 40))
+    expected = method(memory).restore(codes, 1, 14)
+    sizes = []
+    corrected = merging.corrected
+
+    def noted(network, merged, *given):
+        sizes.append(len(merged.mean_code))
+        return corrected(network, merged, *given)
+
+    monkeypatch.setattr(merging, "is_gpu", lambda device: True)
+    monkeypatch.setattr(merging, "corrected", noted)
+    found = method(memory).restore(codes, 1, 14)
+    assert np.abs(found - expected).max() < 1e-5 * codes.white
+    assert sum(sizes) == 13
+    assert max(sizes) == most
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 10, 7), (3, 17, 9)])
