@@ -107,7 +107,7 @@ def likeliest(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> A
     """
     distinct, kinds = np.unique(shares, return_inverse=True)
     light = levels(tuple(distinct), sensor, exposure)
-    table = _log_pmf(tuple(distinct), sensor, exposure)
+    table = log_pmf(tuple(distinct), sensor, exposure)
     found = np.empty(codes.shape[1])
     step = max(1, CHUNK // table.shape[1])
     for start in range(0, len(found), step):
@@ -142,7 +142,7 @@ def table_bytes(shares: Iterable[float], sensor: Sensor, exposure: float) -> int
 
 
 @lru_cache(maxsize=4)
-def _log_pmf(shares: tuple[float, ...], sensor: Sensor, exposure: float) -> Array:
+def log_pmf(shares: tuple[float, ...], sensor: Sensor, exposure: float) -> Array:
     """Return the logarithm of the probability of each code of these exposures, [G, shares x levels].
 
     `ValueError` if it takes more than TABLE_BYTES.

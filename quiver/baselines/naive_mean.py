@@ -9,6 +9,8 @@ ignored: at 3.25 photons per pixel (3 bits, gain 1.077) the estimate is 4 % low,
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy import ndarray as Array
 
@@ -20,6 +22,12 @@ def dark_codes(sensor: Sensor, exposure: float) -> float:
     """Return the codes that a linear sensor would have in the dark."""
     slope = (sensor.levels - 1) / sensor.white(exposure)  # codes per photon
     return slope * sensor.dark_rate * exposure / sensor.efficiency + sensor.offset
+
+
+def photons_of_sums(sensor: Sensor, exposure: float, count: int) -> Array:
+    """Return the photons of each sum of `count` codes, float64 [sums]."""
+    step = sensor.white(exposure) / (sensor.levels - 1)
+    return (np.arange(count * (sensor.levels - 1) + 1) / count - dark_codes(sensor, exposure)) * step
 
 
 def restore(
@@ -36,10 +44,5 @@ def restore(
     Below the codes of a dark pixel it is negative, so that noise adds no light.
     `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
     """
-    dark = dark_codes(sensor, exposure)
-    step = sensor.white(exposure) / (sensor.levels - 1)
-
-    def table_of(count: int) -> Array:
-        return (np.arange(count * (sensor.levels - 1) + 1) / count - dark) * step
-
+    table_of = partial(photons_of_sums, sensor, exposure)
     return restore_by_sums(codes, sensor, window, table_of, photons_per_unit, frames)

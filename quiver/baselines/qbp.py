@@ -147,9 +147,9 @@ def frame_shifts(frames: Tensor, window: range, settings: Settings = CALIBRATED)
     """Return shifts [K, 2, N] of the patches of the middle frame of a window in each of K frames [K, H, W].
 
     `window` holds the places of its frames; those below 0 and from K on lie beyond the ends of the clip. Means of
-    blocks are matched (`_matched`). Shifts follow linearly in time between them, and at constant speed beyond.
+    blocks are matched (`matched`). Shifts follow linearly in time between them, and at constant speed beyond.
     """
-    found = _matched(len(frames), window, settings)
+    found = matched(len(frames), window, settings)
     middle = window[len(window) // 2]
     pyramids = [patch_alignment.pyramid(frames[span.start : span.stop].mean(0)) for span in found]
     own = next(i for i, span in enumerate(found) if middle in span)
@@ -160,11 +160,11 @@ def frame_shifts(frames: Tensor, window: range, settings: Settings = CALIBRATED)
     ]
     times = torch.tensor([(span.start + span.stop - 1) / 2 for span in found])
     # Matched blocks are fewer than frames: between their middles a patch moves evenly.
-    shifts = _interpolate(torch.arange(len(frames)).float() - times[own], times - times[own], torch.stack(moves))
+    shifts = interpolate(torch.arange(len(frames)).float() - times[own], times - times[own], torch.stack(moves))
     return shifts - shifts[middle]
 
 
-def _matched(count: int, window: range, settings: Settings) -> list[range]:
+def matched(count: int, window: range, settings: Settings) -> list[range]:
     """Return which of `count` frames are averaged for matching, in rising order; one range holds the middle frame.
 
     A range has `prefilter` blocks and shares no frame with that of the middle: shared noise would pull shifts to zero.
@@ -185,7 +185,7 @@ def _matched(count: int, window: range, settings: Settings) -> list[range]:
     return [range(blocks[span[0]].start, blocks[span[-1]].stop) for span in (found if len(found) > 1 else spans(0))]
 
 
-def _interpolate(place: Tensor, known: Tensor, values: Tensor) -> Tensor:
+def interpolate(place: Tensor, known: Tensor, values: Tensor) -> Tensor:
     """Return shifts at other times from shifts [K, ...] at rising times [K], one of them 0: linear, in proportion
     beyond, and at the speed of the other side where one side has none.
     """

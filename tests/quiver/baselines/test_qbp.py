@@ -149,7 +149,7 @@ def test_matched_means_share_no_frame_with_the_middle_and_are_cut_where_the_clip
     """Complete windows of 11, 7 and 21 frames in blocks of 7; then the first frames of a clip, and a short clip."""
 
     def matched(count, window, **settings):
-        return [(span.start, span.stop) for span in qbp._matched(count, window, qbp.Settings(**settings))]
+        return [(span.start, span.stop) for span in qbp.matched(count, window, qbp.Settings(**settings))]
 
     assert matched(11, range(11)) == [(0, 3), (1, 4), (4, 7), (7, 10), (8, 11)]
     assert matched(7, range(7)) == [(i, i + 1) for i in range(7)]
