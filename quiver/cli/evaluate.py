@@ -267,7 +267,7 @@ class Bench:
     ] = None
     size: Annotated[tuple[int, int], setting("ROWSxCOLUMNS in px", unset="64x64", read=frame_size)] = (64, 64)
     ppp: Annotated[Light, setting("light of the fixed clip")] = 3.25
-    device: Annotated[str | None, setting("device of networks", unset="auto", choices=DEVICES)] = None
+    device: Annotated[str | None, setting("device", unset="auto", choices=DEVICES)] = None
     output: Annotated[Path | None, setting("folder for bench.md, bench.json, bench.png", short="o")] = None
     force: Annotated[bool, setting("replace an existing result")] = False
 

@@ -35,7 +35,7 @@ from quiver.evaluation import metrics
 from quiver.model.names import NETWORKS, QUIVERS
 from quiver.restoration.interface import MODES, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, wrap_network
-from quiver.restoration.restorers import is_classical, restorer, weights_path
+from quiver.restoration.restorers import is_classical, restorer, runs_on_any_device, weights_path
 
 EXPOSURE = 5e-4  # s
 LONG = 10.0  # s; the first run of a process took 7 % longer than the second at 2.5 s, and no longer at 17 s
@@ -131,7 +131,7 @@ def measure(case: CostCase, settings: CostSettings) -> CostRow:
         codes, photons = fixed_clip(settings)
     first = (settings.frames - settings.restored) // 2
     last = first + settings.restored
-    memory = PeakMemory(pick_device(settings.device) if method.learned else "cpu")
+    memory = PeakMemory(method.device)
     restored, seconds = _timed(method, codes, first, last if method.together > 1 else first + 2)
     peak = memory.bytes()
     if method.together == 1 or seconds < LONG:
@@ -264,13 +264,15 @@ def checked_cases(
             load(weights_path(method))
     _check_known("modes", modes, MODES)
     _check_known("precisions", precisions, ("float32", "bfloat16"))
-    for option, value in (("modes", modes), ("precisions", precisions), ("device", device)):
+    for option, value in (("modes", modes), ("precisions", precisions)):
         if value is not None and not networks:
             raise ValueError(f"{option}=: acts on networks, and {', '.join(methods)} is classical; leave it out")
     if modes is not None and networks and all(_has_one_mode(network) for network in networks):
         raise ValueError(f"modes=: acts on QUIVER, {', '.join(networks)} has one mode; leave it out")
-    if networks:
+    if any(runs_on_any_device(method) for method in methods):
         pick_device(device or "auto")
+    elif device is not None:
+        raise ValueError(f"device=: {', '.join(methods)} computes where it will; leave it out")
     return cases_of(methods, modes or ("exact", "streaming"), precisions or ("float32",))
 
 
@@ -282,9 +284,9 @@ def _check_known(option: str, given: Sequence[str] | None, known: Sequence[str])
 
 
 def device_of(cases: Sequence[CostCase], wanted: str | None) -> str:
-    """Return the device of the networks among the cases; without any that of classical methods."""
-    learned = any(not is_classical(case.method) for case in cases)
-    return pick_device(wanted or "auto") if learned else "cpu"
+    """Return the device of the cases; that of methods of others is not known, and taken as the CPU."""
+    chosen = any(runs_on_any_device(case.method) for case in cases)
+    return pick_device(wanted or "auto") if chosen else "cpu"
 
 
 def markdown(costs: Sequence[CostRow], settings: CostSettings) -> str:

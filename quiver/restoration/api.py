@@ -59,8 +59,8 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     `source` is one of these: a `Stream`; a `Clip` (its only stream; with `ppp` the default sensor senses it now); the
     path of either; integer codes [T, H, W], for which `sensor` and `exposure` [s] must be given. `method` is a
     classical method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d, path-merge), the weights that ship
-    (mergenet), a .safetensors file or a folder of `quiver train`. `device` (auto, cpu, cuda) and `mode` (exact,
-    streaming, windows) are for networks. `auto` takes mergenet, or a classical method where that was measured to be
+    (mergenet), a .safetensors file or a folder of `quiver train`. `device` is auto, cpu or cuda; `mode` (exact,
+    streaming, windows) is for networks. `auto` takes mergenet, or a classical method where that was measured to be
     better, and `likelihood` for codes of different exposures. `defects` [H, W] is true at hot and dead pixels, which
     are filled from their neighbours, as are those that a stream's description states; crosstalk and afterpulses, which
     are not inverted, warn. A network outside of what it was measured for warns; with `strict` it is a `ValueError`.

@@ -41,7 +41,7 @@ class RestoreOptions:
         Whole | None,
         setting(
             "working memory, as in 500MB",
-            unset="2GB; on a GPU half of its memory for networks other than mergenet",
+            unset="2GB; on a GPU half of its memory",
             read=memory_size,
         ),
     ] = None  # bytes
@@ -49,7 +49,7 @@ class RestoreOptions:
         str,
         setting("networks: how frames share work, exact for the published windows, streaming is faster", choices=MODES),
     ] = "exact"
-    device: Annotated[str, setting("networks: where they run", choices=DEVICES)] = "auto"
+    device: Annotated[str, setting("where methods run", choices=DEVICES)] = "auto"
     precision: Annotated[str, setting("networks: precision", choices=PRECISIONS)] = "float32"
 
     def __post_init__(self) -> None:
@@ -78,6 +78,7 @@ class Restorer:
     together: int = 1  # frames that are restored at a time and share most of the work
     scope: Scope | None = None  # of a network: the streams that it was measured for or trained on; None: not known
     device: str = "cpu"  # where it runs
+    any_device: bool = True  # whether the device can be chosen; a method of others computes where it will
     bands: LearnedBands | None = None  # R, G and B of the light behind colour filters; None: the linear estimate
     seen: int | None = None  # most frames used for one, if the first and the last of `window` are never used together
 

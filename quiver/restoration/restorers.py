@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -27,10 +27,14 @@ from qsim.files import Progress
 from quiver.baselines import METHODS, exposures
 from quiver.baselines.methods import Method
 from quiver.baselines.sliding_window import look_ahead
-from quiver.data.codes import Codes
+from quiver.data.codes import Codes, Sensor
+from quiver.device import device_of_process, is_gpu, pick_device
 from quiver.model.names import NETWORKS
 from quiver.restoration.interface import AUTO, RestoreInto, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
+
+if TYPE_CHECKING:
+    import torch
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"  # weights that ship with the package
 FRAME_BYTES = 16  # per pixel and frame that a classical method holds: codes and video
@@ -59,6 +63,11 @@ def restorer(name: str, options: RestoreOptions | None = None) -> Restorer:
 def is_classical(name: str) -> bool:
     """Return whether a name is that of a classical method, or of a method of others, and not of a network."""
     return name.partition(":")[0] in METHODS or _is_of_others(name)
+
+
+def runs_on_any_device(name: str) -> bool:
+    """Return whether the device of a method can be chosen: a method of others computes where it will."""
+    return not _is_of_others(name)
 
 
 def _is_of_others(name: str) -> bool:
@@ -92,6 +101,7 @@ def _of_others(base: str, window: str, options: RestoreOptions) -> Restorer:
     return replace(
         made,
         name=f"{short}:{window}" if window else short,
+        any_device=False,
         identity={**made.identity, "method": short, **asdict(plugin.source)},
     )
 
@@ -119,9 +129,16 @@ def _classical(name: str, method: Method, window: str, options: RestoreOptions) 
     if window and not (window.isdecimal() and int(window) > 0):
         raise ValueError(f"method {name!r}: the window after the colon is a number of frames, as in {base}:5")
     frames = int(window) if window else method.window
+    kind = Restorer.device if isinstance(method, OwnMethod) else pick_device(options.device)
     run = partial(method.restore, window=frames) if window else method.restore
 
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
+        device = device_of_process(kind)
+        if is_gpu(device) and codes.shares is None:
+            memory = options.bound()
+            there = partial(_restore_there, base, frames, device, memory)
+            fill_classical(there, frames, codes, out, first, memory, progress)
+            return
         taken = method.bytes_per_pixel * codes.shape[1] * codes.shape[2]
         memory = options.bound(host=True)
         if taken > memory:
@@ -138,7 +155,26 @@ def _classical(name: str, method: Method, window: str, options: RestoreOptions) 
         fill_classical(bracketed, frames, codes, out, first, free, progress)
 
     identity = {"method": base, "window": frames}
-    return Restorer(name, frames, look_ahead(frames), False, method.description, fill, identity=identity)
+    return Restorer(name, frames, look_ahead(frames), False, method.description, fill, identity=identity, device=kind)
+
+
+def _restore_there(
+    name: str,
+    window: int,
+    device: torch.device,
+    memory: int,
+    codes: Array,
+    sensor: Sensor,
+    exposure: float,
+    *,
+    frames: range,
+) -> Array:
+    """Restore codes by a classical method on a device."""
+    from quiver.baselines.batched import methods
+
+    return methods.restore(
+        codes, sensor, exposure, method=name, device=device, window=window, memory=memory, frames=frames
+    )
 
 
 def _fill_equal_exposures(

@@ -44,12 +44,18 @@ def refuse(asked: Any, names: Sequence[str], why: str) -> None:
 def refuse_idle(asked: Mapping[str, Any], methods: Sequence[Restorer]) -> None:
     """Raise `ArgumentError` for a mode, precision or device that is given and that none of the methods uses.
 
-    A classical method that `auto` chose lets the precision and the device pass: they were meant for its network.
+    A classical method that `auto` chose lets the precision pass: it was meant for its network.
     """
     names = ", ".join(method.name for method in methods)
     for argument in ("mode", "precision", "device"):
         value = asked.get(argument)
         if value is None:
+            continue
+        if argument == "device":
+            if not any(method.any_device for method in methods):
+                raise ArgumentError(
+                    argument, f"{names} is a method of others, which computes where it will; leave it out"
+                )
             continue
         if not any(method.learned for method in methods):
             if asked.get("method") == AUTO and argument != "mode":

@@ -261,7 +261,7 @@ def test_a_curve_that_falls_is_told(capsys, tiny_dataset, tmp_path, monkeypatch,
     [
         (("moment",), {"modes": ("exact",)}, "modes=: acts on networks, and moment is classical"),
         (("moment", "naive"), {"precisions": ("float32",)}, "precisions=: acts on networks, and moment, naive"),
-        (("moment",), {"device": "cpu"}, "device=: acts on networks"),
+        (("moment",), {"device": "cuda"}, "device=cuda: torch finds no CUDA device here"),
         (("unet",), {"modes": ("exact",)}, "modes=: acts on QUIVER, unet has one mode"),
         (("quiver-s",), {"modes": ("exat",)}, "modes=: no 'exat' (did you mean 'exact'?)"),
         (("quiver-s",), {"precisions": ("float16",)}, "precisions=: no 'float16' (did you mean 'bfloat16'?)"),

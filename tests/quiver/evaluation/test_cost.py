@@ -120,7 +120,7 @@ def test_a_bench_states_the_device_that_was_used(monkeypatch, capsys):
     for there, kind in ((True, "cuda"), (False, "cpu")):
         monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
         assert device_of([CostCase("moment:3"), CostCase("unet")], None) == kind
-        assert device_of([CostCase("moment:3")], None) == "cpu"
+        assert device_of([CostCase("moment:3")], None) == kind
         assert device_of([CostCase("unet")], "cpu") == "cpu"
 
 

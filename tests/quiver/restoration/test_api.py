@@ -20,7 +20,7 @@ def test_the_command_and_the_call_have_one_default_method(inputs, tmp_path):
     ("changes", "message"),
     [
         ({"mode": "streaming"}, "mode: acts on networks, and moment is classical"),
-        ({"device": "cpu"}, "device: acts on networks"),
+        ({"device": "cuda"}, "device=cuda: torch finds no CUDA device here"),
     ],
 )
 def test_the_call_refuses_what_it_would_ignore(inputs, changes, message):

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from clips import ClipMaker
 from numpy import ndarray as Array
 from random_codes import EXPOSURE, SENSOR, random_codes
 
 from qsim.restored_video import Restored
-from quiver.baselines import METHODS
+from quiver.baselines import METHODS, batched
+from quiver.baselines.batched import methods
 from quiver.data.codes import Codes, sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
@@ -19,6 +22,7 @@ from quiver.model.presets import build
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration import restored_file
+from quiver.restoration import restorers as restorers_module
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 from quiver.restoration.restored_file import restore_to_file
@@ -43,6 +47,27 @@ def test_a_window_after_the_colon():
     np.testing.assert_array_equal(three.restore(codes), expected)
     with pytest.raises(ValueError, match="as in moment:5"):
         restorer("moment:many")
+
+
+@pytest.mark.parametrize("name", ["moment:3", "qbp", "qbp-bm3d"])
+def test_on_a_gpu_classical_methods_run_in_batches(name, monkeypatch):
+    """The CPU takes the place of the GPU; results are those of the CPU's own form, but for rounding."""
+    codes = random_codes(7, 20, 25)
+    expected = restorer(name).restore(codes, 1, 6)
+    asked = []
+
+    def noted(*given: object, **settings: object) -> Array:
+        asked.append(settings["frames"])
+        return methods.restore(*given, **settings)
+
+    monkeypatch.setattr(restorers_module, "pick_device", lambda wanted: "cuda")
+    monkeypatch.setattr(restorers_module, "device_of_process", lambda kind: torch.device("cpu"))
+    monkeypatch.setattr(restorers_module, "is_gpu", lambda device: True)
+    monkeypatch.setattr(batched, "methods", SimpleNamespace(restore=noted))
+    there = restorer(name, RestoreOptions(device="cuda", memory=10**9))
+    assert there.device == "cuda"
+    np.testing.assert_allclose(there.restore(codes, 1, 6), expected, atol=1e-4)
+    assert asked == [range(1, 6)]
 
 
 def test_methods_of_one_table_have_names_of_their_own(tmp_path):
