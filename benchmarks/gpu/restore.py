@@ -12,7 +12,7 @@ from train import PRECISIONS, networks
 
 
 def names(sizes: Sizes) -> list[str]:
-    """Return all networks in each precision, then the classical methods, which no GPU makes faster."""
+    """Return all networks in each precision, then the classical methods."""
     from quiver.baselines import METHODS
 
     return [*(f"{network}-{precision}" for network in learned() for precision in PRECISIONS), *METHODS]
@@ -39,8 +39,7 @@ def measure(job: Job) -> list[dict[str, Any]]:
     name, _, precision = (job.name, "", "float32") if classical else job.name.rpartition("-")
     source, weights = (name, "none needed") if classical else weights_of(job.out, name)
     case = CostCase(source, "exact", precision)
-    slow = classical or kind == "cpu"
-    restored = sizes.restored_slow if slow else sizes.restored
+    restored = sizes.restored_slow if kind == "cpu" else sizes.restored
     settings = CostSettings(
         sizes.height, sizes.width, frames=restored + 10, restored=restored, device=kind, threads=threads.use().number
     )
@@ -48,14 +47,14 @@ def measure(job: Job) -> list[dict[str, Any]]:
     row = {
         "method": name,
         "precision": precision,
-        "device": "cpu" if classical else kind,
+        "device": kind,
         "weights": weights,
         "size": f"{sizes.height} x {sizes.width}",
         "frames per s": 1 / cost.seconds_per_frame,
         "peak memory [MB]": cost.peak_bytes / 1e6,
         "GMAC per frame": None if classical else cost.gmac_per_frame,
     }
-    return [row | ({} if classical else _error(case, kind, sizes))]
+    return [row | _error(case, kind, sizes)]
 
 
 def weights_of(out: Path, network: str) -> tuple[str, str]:
