@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 DEVICES = ("auto", "cpu", "cuda")
 HOST_MEMORY = 2_000_000_000  # bytes; working memory where none is stated and no GPU runs
+AHEAD = 2  # training steps that a host may be ahead of its GPU: enough to keep it busy
 
 
 def pick_device(wanted: str) -> str:
@@ -46,8 +47,8 @@ def device_of_process(kind: str) -> torch.device:
 
 
 def group_backend(kind: str) -> str:
-    """Return the library by which processes on such devices exchange gradients."""
-    return "nccl" if kind == "cuda" else "gloo"
+    """Return the library by which processes on such devices exchange gradients; hosts exchange numbers by gloo."""
+    return "cpu:gloo,cuda:nccl" if kind == "cuda" else "gloo"
 
 
 def is_gpu(device: torch.device) -> bool:
@@ -58,6 +59,32 @@ def is_gpu(device: torch.device) -> bool:
 def moved(tensor: Tensor, device: torch.device) -> Tensor:
     """Return the tensor on the device; the copy of a pinned one does not wait for the GPU."""
     return tensor.to(device, non_blocking=tensor.is_pinned())
+
+
+def steps_ahead(device: torch.device) -> int:
+    """Return how many training steps the host may be ahead of the device; none where it computes them itself."""
+    return AHEAD if is_gpu(device) else 0
+
+
+class Reading:
+    """Numbers of a device on their way to the host: nothing waits for them until `values` is called."""
+
+    def __init__(self, numbers: Tensor) -> None:
+        """Begin the copy of numbers [n]."""
+        import torch
+
+        gpu = is_gpu(numbers.device)
+        self.host = torch.empty(numbers.shape, dtype=numbers.dtype, pin_memory=gpu)
+        self.host.copy_(numbers, non_blocking=gpu)
+        self.copied = torch.cuda.Event() if gpu else None
+        if self.copied is not None:
+            self.copied.record()
+
+    def values(self) -> list[float]:
+        """Return the numbers, as soon as the device has computed them; later work of it goes on."""
+        if self.copied is not None:
+            self.copied.synchronize()
+        return list(map(float, self.host.tolist()))
 
 
 def wait(device: torch.device) -> None:

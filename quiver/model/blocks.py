@@ -152,8 +152,9 @@ class FlowNetwork(nn.Module):
     @staticmethod
     def _to_size(flow: Tensor, height: int, width: int) -> Tensor:
         # Each component is resized as its own axis is.
-        scale = flow.new_tensor((width / flow.shape[3], height / flow.shape[2])).view(1, 2, 1, 1)
-        return resize(flow, height, width) * scale
+        # Filled on the device: numbers that are copied to a GPU would make the host wait.
+        factors = [flow.new_full((), new / old) for new, old in ((width, flow.shape[3]), (height, flow.shape[2]))]
+        return resize(flow, height, width) * torch.stack(factors).view(1, 2, 1, 1)
 
 
 def neighbourhoods(frames: Tensor, before: int = NEIGHBOURS // 2, after: int = NEIGHBOURS // 2) -> Tensor:

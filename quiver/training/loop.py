@@ -5,6 +5,7 @@
 Inputs, loss and scored frame are those of the model's system (systems.py). Samples are numbered across steps and
 processes: a run that was killed and resumed draws the same ones, and ends with the same weights, as one that was not.
 NaN or Inf stop the run; the message names step and samples. Under `torchrun` every process draws its share of a batch.
+On a GPU the host reads the numbers of a step two steps later (ahead.py), and before anything is stored.
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ from __future__ import annotations
 import contextlib
 import importlib
 import math
+import os
 import sys
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -32,11 +35,13 @@ from quiver.data.clips import clips_digest, split_clips, unfinished
 from quiver.data.illumination import OTHERS
 from quiver.data.stream_windows import StreamWindows
 from quiver.data.windows import Batches, Windows, WindowSettings
-from quiver.device import is_gpu, moved
+from quiver.device import Reading, is_gpu, moved, steps_ahead
 from quiver.evaluation import metrics
 from quiver.host import flushed_denormals
 from quiver.model.mosaic_network import MosaicNet
 from quiver.model.presets import on_mosaics
+from quiver.training.ahead import Copy, Pending
+from quiver.training.compiling import Compiled, why_not
 from quiver.training.optimiser import Optimiser
 from quiver.training.processes import Process, begin_worker, joined, plain_errors
 from quiver.training.run_folder import Run
@@ -49,6 +54,8 @@ from quiver.training.systems import OURS, system_of
 
 AnyWindows = Windows | StreamWindows
 FOREVER = 10**9  # steps of a run that only time limits
+PREFETCHED = 4  # batches that each worker draws in advance
+MOST_WORKERS = 16  # that are started for a GPU if their number is not stated
 VALIDATION_SIDE = 128  # px, of the validation windows at most
 
 
@@ -100,17 +107,39 @@ def batches(windows: AnyWindows, settings: Settings, state: State, process: Proc
     """Yield the batches from the current step on; workers draw the same bytes as this process."""
     last = state.step if state.finished else settings.steps or FOREVER
     numbers = Batches(settings.batch, state.step, last, process.rank, process.world)
+    workers = drawing_processes(settings.workers, process)
     loader = DataLoader(
         windows,
         batch_sampler=numbers,
-        num_workers=settings.workers,
-        multiprocessing_context="spawn" if settings.workers else None,
+        num_workers=workers,
+        multiprocessing_context="spawn" if workers else None,
+        prefetch_factor=PREFETCHED if workers else None,
         worker_init_fn=begin_worker,
         generator=torch.Generator(),  # separate: the loader must not change the global random state
         pin_memory=is_gpu(process.device),
     )
     with plain_errors():
         yield from loader
+
+
+def drawing_processes(asked: int | None, process: Process) -> int:
+    """Return how many processes draw samples: as asked, else none beside a CPU that trains, and most cores for a GPU.
+
+    Each of the processes of a machine that train keeps a core.
+    """
+    if asked is not None:
+        return asked
+    if not is_gpu(process.device):
+        return 0
+    here = int(os.environ.get("LOCAL_WORLD_SIZE", process.world))
+    return max(1, min(MOST_WORKERS, threads.cores() // here - 1))
+
+
+def parts_of(batch: Batch, count: int) -> Iterator[Batch]:
+    """Yield a batch in `count` parts of as many windows each."""
+    size = len(batch["codes"]) // count
+    for first in range(0, size * count, size):
+        yield batch if count == 1 else {name: value[first : first + size] for name, value in batch.items()}
 
 
 def precision_of(settings: Settings, device: torch.device) -> str:
@@ -129,8 +158,9 @@ def source_digest(windows: AnyWindows, fixed: Subset[dict[str, Any]] | None) -> 
 
 
 def on_device(batch: Batch, device: torch.device) -> Batch:
-    """Return a batch with its tensors on the device."""
-    return {name: moved(value, device) if isinstance(value, Tensor) else value for name, value in batch.items()}
+    """Return a batch with its tensors on the device; numbers of samples are for messages and stay here."""
+    here = {name: value for name, value in batch.items() if not isinstance(value, Tensor) or name == "sample"}
+    return here | {name: moved(value, device) for name, value in batch.items() if name not in here}
 
 
 @torch.no_grad()
@@ -174,12 +204,13 @@ class Board:
         )
         self.psnr = ""
 
-    def step(self, state: State, loss: float, norm: float, rate: float) -> None:
+    def step(self, number: int, loss: float, norm: float, rate: float) -> None:
+        """Show a step; the first one has the number 1."""
         self.bar.update()
-        if state.step % 20 == 0:
+        if number % 20 == 0:
             self.bar.set_postfix_str(f"loss {loss:.4f}{self.psnr}", refresh=False)
             for name, value in (("loss", loss), ("gradient norm", norm), ("learning rate", rate)):
-                self.writer.add_scalar(f"train/{name}", value, state.step)
+                self.writer.add_scalar(f"train/{name}", value, number)
 
     def validation(self, state: State, score: metrics.Score, picture: Tensor) -> None:
         self.psnr = f", PSNR {score.psnr_matched:.2f} dB"
@@ -197,7 +228,13 @@ class Trainer:
     """Training of one model: steps, validations when they are due, and checkpoints."""
 
     def __init__(
-        self, model: nn.Module, run: Run, fixed: Subset[dict[str, Any]] | None, process: Process, system: System
+        self,
+        model: nn.Module,
+        run: Run,
+        fixed: Subset[dict[str, Any]] | None,
+        process: Process,
+        system: System,
+        note: Callable[[str], None] = lambda line: None,
     ) -> None:
         settings = run.settings
         self.system = system
@@ -207,19 +244,17 @@ class Trainer:
         self.process = process
         self.optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
         self.state = run.load(model, self.optimiser)
-        # Parameters that a loss does not use at some step (a teacher, a turned-off part)
-        # have no gradient; processes wait for all gradients unless told to look.
-        objective = Objective(model, system.loss, settings)
-        self.parallel = (
-            nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
-            if process.world > 1
-            else objective
-        )
+        self.objective = Objective(model, system.loss, settings)
+        self.parallel: nn.Module | None = None  # the same, joined with other processes; from the first step on
+        self.note = note
+        self.ahead = steps_ahead(process.device)
+        self.pending: deque[Pending] = deque()  # steps whose numbers were not read
+        self.copies: list[Copy] = []  # whose memory is free
         self.low = precision_of(settings, process.device) == "bfloat16"
         self.board: Board | None = None
         self.started = time.monotonic() - self.state.elapsed
         self.saved = time.monotonic()
-        self.loss = math.nan  # of the last step
+        self.loss = math.nan  # of the last step that was read
         self.rate = math.nan
         self.validation = 0.0  # s, duration of the last one
         self.validated = False
@@ -233,30 +268,95 @@ class Trainer:
         if self.process.world > 1:  # the stored random state is the leader's: every process draws from its samples
             torch.manual_seed(Key(settings.seed, int(batch["sample"][0])).philox_key >> 1)
         self.rate = learning_rate(settings, state)
-        with torch.autocast(device.type, torch.bfloat16, enabled=self.low):
-            loss = self.parallel(on_device(batch, device), share_used(settings, state))
-        self.model.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_norm).item()
-        self.loss = loss.item()
-        if self.process.any(not math.isfinite(self.loss + norm)):
-            self._fail(batch, norm)
+        moved_batch = on_device(batch, device)
+        if self.parallel is None:
+            self.parallel = self._ready(moved_batch)
+        before = self._copy() if self.ahead else None
+        loss = self._gradients(self.parallel, moved_batch)
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_norm)
+        numbers = Reading(torch.stack([loss, norm]))
+        samples = batch["sample"].tolist()
+        self.pending.append(Pending(replace(state), self.rate, samples, list(batch["key"]), numbers, before))
+        if not self.ahead:
+            self.settle()  # before the weights change
         self.optimiser.step(self.rate)
         state.step = state.step + 1
         # The learning rate follows the time, so all processes need the same one.
         state.elapsed = self.process.from_leader(time.monotonic() - self.started)
-        if self.board is not None:
-            self.board.step(state, self.loss, norm, self.rate)
+        self.settle(self.ahead)
 
-    def _fail(self, batch: dict[str, Any], norm: float) -> NoReturn:
-        """Save the state before the bad step and stop, naming the samples."""
+    def _ready(self, batch: Batch) -> nn.Module:
+        """Return the objective as steps compute it: compiled, if the settings say so, and joined with other processes.
+
+        Compiling is tried with the first batch; where it fails in any process, all go on without it.
+        """
+        if self.run.settings.compile != "off":
+            before = Copy().take(self.model, self.optimiser)
+            problem = ""
+            try:
+                network = Compiled(self.model, self.run.settings.compile)
+                self.objective.use_compiled(network)
+                self._gradients(self.objective, batch)
+                problem = "" if network.called else why_not(None)
+            except Exception as error:  # of many kinds; what compiling does not cause, the step itself raises again
+                problem = why_not(error)
+            before.restore(self.model, self.optimiser)
+            if self.process.any(problem != ""):
+                self.objective.use_compiled(None)
+                self.note(problem or "torch.compile fails in another process, so the network is not compiled")
+        if self.process.world == 1:
+            return self.objective
+        # Parameters that a loss does not use at some step (a teacher, a turned-off part)
+        # have no gradient; processes wait for all gradients unless told to look.
+        return nn.parallel.DistributedDataParallel(self.objective, find_unused_parameters=True)
+
+    def _gradients(self, objective: nn.Module, batch: Batch) -> Tensor:
+        """Add up the gradients of the parts of a batch, and return its loss, a scalar on the device."""
+        settings = self.run.settings
+        share = share_used(settings, self.state)
+        count = settings.accumulate
+        self.model.zero_grad(set_to_none=True)
+        total: Tensor | None = None
+        for number, part in enumerate(parts_of(batch, count), 1):
+            # Processes exchange the gradients of a batch once, after its last part.
+            alone = number < count and isinstance(objective, nn.parallel.DistributedDataParallel)
+            with objective.no_sync() if alone else contextlib.nullcontext():  # type: ignore[operator]
+                with torch.autocast(self.process.device.type, torch.bfloat16, enabled=self.low):
+                    loss = objective(part, share)
+                loss = loss if count == 1 else loss / count
+                loss.backward()
+            total = loss.detach() if total is None else total + loss.detach()
+        assert total is not None
+        return total
+
+    def _copy(self) -> Copy:
+        """Return a copy of the state before a step."""
+        return (self.copies.pop() if self.copies else Copy()).take(self.model, self.optimiser)
+
+    def settle(self, left: int = 0) -> None:
+        """Read the numbers of all steps but the last `left`; `Diverged` for the first one that is not finite."""
+        while len(self.pending) > left:
+            step = self.pending.popleft()
+            self.loss, norm = step.numbers.values()
+            if self.process.any(not math.isfinite(self.loss + norm)):
+                self._fail(step, norm)
+            if self.board is not None:
+                self.board.step(step.state.step + 1, self.loss, norm, step.rate)
+            if step.before is not None:
+                self.copies.append(step.before)
+
+    def _fail(self, step: Pending, norm: float) -> NoReturn:
+        """Bring back the state before a bad step, save it and stop, naming the samples."""
+        self.pending.clear()
+        self.state = step.state
+        if step.before is not None:
+            step.before.restore(self.model, self.optimiser)
         rank = self.process.rank
-        samples = batch["sample"].tolist()
         path = self.run.folder / ("failed.pt" if rank == 0 else f"failed-{rank}.pt")
-        self.run.save(path, self.model, self.optimiser, self.state, samples=samples, keys=list(batch["key"]))
+        self.run.save(path, self.model, self.optimiser, self.state, samples=step.samples, keys=step.keys)
         raise Diverged(
-            f"step {self.state.step}: loss {self.loss:g}, gradient norm {norm:g}; samples {samples} "
-            f"({batch['key'][0]}; ...); state before the step: {path}"
+            f"step {self.state.step}: loss {self.loss:g}, gradient norm {norm:g}; samples {step.samples} "
+            f"({step.keys[0]}; ...); state before the step: {path}"
         )
 
     def validate_if_due(self) -> None:
@@ -269,6 +369,7 @@ class Trainer:
         state.finished = state.step == settings.steps or out_of_time
         if not self.process.any(validation_due(settings, state)) and not state.finished:
             return
+        self.settle()  # nothing is stored of a step that was not read
         began = time.monotonic()
         if self.fixed is None:  # nothing to validate on: the last weights count as the best
             if self.board is not None and state.finished:
@@ -297,10 +398,14 @@ class Trainer:
     def save(self, *, now: bool) -> None:
         """Write the checkpoint if the last one is old, after the first validation without any, or `now`."""
         first = self.validated and not self.stored
-        if self.process.leads and (now or first or time.monotonic() - self.saved > CHECKPOINT_SECONDS):
+        old = time.monotonic() - self.saved > CHECKPOINT_SECONDS
+        if not self.process.any(self.process.leads and (now or first or old)):
+            return
+        self.settle()
+        if self.process.leads:
             self.run.save(self.run.checkpoint, self.model, self.optimiser, self.state)
-            self.saved = time.monotonic()
-            self.stored = True
+        self.saved = time.monotonic()
+        self.stored = True
 
 
 def for_bands(model: nn.Module, settings: Settings) -> nn.Module:
@@ -366,7 +471,7 @@ def train(
             importlib.import_module("torch.utils.tensorboard")  # this and the line above fail before a run is removed
             stack.enter_context(run.open(force=force))
         process.wait()
-        trainer = Trainer(model, run, fixed, process, system)
+        trainer = Trainer(model, run, fixed, process, system, note if process.leads else lambda line: None)
         if process.leads:
             for line in lines:
                 note(line)

@@ -33,16 +33,18 @@ class Process:
 
     def from_leader(self, number: float) -> float:
         """Return the leader's number in every process."""
-        value = torch.tensor(number, dtype=torch.float64, device=self.device)
-        if self.world > 1:
-            torch.distributed.broadcast(value, 0)
+        if self.world == 1:
+            return number
+        value = torch.tensor(number, dtype=torch.float64)  # on the host, so that nobody waits for a GPU
+        torch.distributed.broadcast(value, 0)
         return float(value)
 
     def any(self, condition: bool) -> bool:
         """Return in every process whether the condition holds in any of them."""
-        flag = torch.tensor(float(condition), device=self.device)
-        if self.world > 1:
-            torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MAX)
+        if self.world == 1:
+            return condition
+        flag = torch.tensor(float(condition))
+        torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MAX)
         return bool(flag)
 
 

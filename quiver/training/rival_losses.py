@@ -158,10 +158,10 @@ def check_memdeblur(network: Any, settings: Settings) -> None:
 
     With two of 32 to 64 px, or three of 32 px, the first gradient was not finite; with four it was.
     """
-    if settings.batch < FEWEST and settings.crop <= 64 and not network.config.group_norm:
+    if settings.together < FEWEST and settings.crop <= 64 and not network.config.group_norm:
         raise ValueError(
-            f"batch={settings.batch} with crop={settings.crop}: batch normalisation of MemDeblur needs {FEWEST} "
-            f"windows or crops above 64 px; give batch={FEWEST}"
+            f"batch={settings.together} with crop={settings.crop}: batch normalisation of MemDeblur needs {FEWEST} "
+            f"windows at once or crops above 64 px; give batch={FEWEST}"
         )
 
 

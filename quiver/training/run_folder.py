@@ -14,7 +14,7 @@ import io
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -132,8 +132,9 @@ class Run:
         wanted = self.settings.to_dict()
         found = read_json(self.folder / "settings.json")
         free = {"out", "workers", "threads"}
+        defaults = {each.name: each.default for each in fields(Settings)}  # of settings that an older run lacks
         for name in wanted:
-            if name not in free and _alone(found.get(name)) != _alone(wanted[name]):
+            if name not in free and _alone(found.get(name, defaults[name])) != _alone(wanted[name]):
                 before = "as in its data set" if found.get(name) is None else short(found[name])
                 raise Blocked(
                     f"{self.folder} holds a run with {name} {before}, now it is {short(wanted[name])}",

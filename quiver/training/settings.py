@@ -105,6 +105,8 @@ class Settings:
         Whole, setting("frames of a training window", unset="the protocol's, mostly 11; of 16, QUIVER restores six")
     ] = 11  # more give more restored frames, at low cost in QUIVER
     batch: Annotated[Whole, setting("windows per step and process", unset="the protocol's")] = 8
+    # Losses are means over windows, so the gradient is that of the whole batch.
+    accumulate: Annotated[Whole, setting("parts of a batch that are computed one after another, to save memory")] = 1
     optimiser: Annotated[Kind, setting("optimiser", unset="the protocol's")] = "adam"  # see optimiser.py
     learning_rate: Annotated[Positive, setting("highest learning rate", unset="the protocol's")] = 1e-3
     betas: tuple[float, float] = (0.9, 0.99)  # of Adam
@@ -129,12 +131,17 @@ class Settings:
     )
     validation_split: Annotated[Split, setting("split to validate on")] = "val"
     validation_windows: Whole = 16  # at most
-    workers: Annotated[Count, setting("processes that draw samples", unset="0: this one")] = 0
+    workers: Annotated[
+        Count | None, setting("processes that draw samples", unset="0: this one; for a GPU most cores")
+    ] = None
     scan: Wanted = None
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"],
         setting("precision", unset="auto: bfloat16 on CUDA; published protocols: float32"),
     ] = "auto"
+    compile: Annotated[
+        Literal["off", "kernels", "graphs"], setting("torch.compile: fused kernels, or CUDA graphs of them")
+    ] = "off"  # see compiling.py
     seed: Annotated[Seed, setting("of weights, samples and noise")] = 0
     threads: Annotated[
         Whole | None,
@@ -147,11 +154,21 @@ class Settings:
         records.settle(self)
         if self.loss not in (*LOSSES, "own"):
             raise ValueError(f"no loss is called {self.loss!r}; known are {', '.join((*LOSSES, 'own'))}")
+        if self.batch % self.accumulate:
+            raise ValueError(
+                f"batch={self.batch}: is no multiple of accumulate={self.accumulate}, and parts of a batch are equal; "
+                "choose another of both"
+            )
 
     @property
     def folders(self) -> tuple[str, ...]:
         """Return the data set folders."""
         return (self.data,) if isinstance(self.data, str) else self.data
+
+    @property
+    def together(self) -> int:
+        """Return the windows that a process computes at once."""
+        return self.batch // self.accumulate
 
     @property
     def sensors(self) -> tuple[str, ...] | None:

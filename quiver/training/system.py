@@ -89,10 +89,16 @@ class Objective(nn.Module):
         self.network = network
         self.loss = loss
         self.settings = settings
+        self._compiled: list[Any] = []  # in a list, as torch would count its weights again
+
+    def use_compiled(self, network: Any | None) -> None:
+        """Compute with this form of the network, which shares its weights; None: with the network itself."""
+        self._compiled = [] if network is None else [network]
 
     def forward(self, batch: Batch, share: float) -> Tensor:
         """Return the loss of a batch, a scalar; `share` of the run is over."""
-        return self.loss(self.network, batch, self.settings, share)
+        network = self._compiled[0] if self._compiled else self.network
+        return self.loss(network, batch, self.settings, share)
 
 
 def protocol(system: System, name: str) -> Protocol:

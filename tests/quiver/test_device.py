@@ -27,7 +27,7 @@ def test_every_process_of_torchrun_has_a_gpu_and_a_way_to_exchange(monkeypatch):
     monkeypatch.setenv("LOCAL_RANK", "3")
     assert device.device_of_process("cuda") == torch.device("cuda", 3)
     assert device.device_of_process("cpu") == CPU
-    assert (device.group_backend("cuda"), device.group_backend("cpu")) == ("nccl", "gloo")
+    assert (device.group_backend("cuda"), device.group_backend("cpu")) == ("cpu:gloo,cuda:nccl", "gloo")
 
 
 def test_tensors_that_are_there_are_not_copied():

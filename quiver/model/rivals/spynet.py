@@ -48,7 +48,8 @@ class SpyNet(nn.Module):
             flow = flow + module(torch.cat([ours, warp(theirs, flow, "border").to(ours.dtype), flow], dim=1))
         assert flow is not None
         flow = F.interpolate(flow, size=(height, width), mode="bilinear", align_corners=False)
-        return flow * flow.new_tensor([width / size[1], height / size[0]]).view(1, 2, 1, 1)
+        factors = [flow.new_full((), new / old) for new, old in ((width, size[1]), (height, size[0]))]
+        return flow * torch.stack(factors).view(1, 2, 1, 1)
 
     def pyramid(self, image: Tensor, size: list[int]) -> list[Tensor]:
         """[N, 1, H, W] -> standardised images [N, 3, h, w], coarsest first; the last has the size."""

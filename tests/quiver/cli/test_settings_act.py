@@ -150,6 +150,7 @@ SITUATIONS = (
     Situation(TRAIN, tensors),
     Situation(TRAIN, history, only=("validate_every", "validation_split")),
     Situation(TRAIN, tensors, only=("minutes", "network", "protocol", "steps", "crop", "batch")),
+    Situation(TRAIN.replace("--batch 1", "--batch 2"), tensors, {"accumulate": "2"}, only=("accumulate",)),
     Situation(TRAIN, names, only=("out",)),
     Situation(CLIP, only=("method", "ppp")),
     Situation(CLIP, names, only=("output",)),
@@ -275,6 +276,8 @@ COMMANDS = Commands(
     results={
         "threads": seen("threads"),
         "output": names,
+        "accumulate": described,
+        "compile": described,
         "restore.frame_rate": described,
         "memory": seen("read"),
         "workers": seen("workers"),
@@ -331,7 +334,7 @@ def scale() -> Iterator[None]:
 
     def loaded(windows: Any, num_workers: int, **named: Any) -> Any:
         see("workers", num_workers)
-        return loader(windows, **named | {"multiprocessing_context": None})
+        return loader(windows, **named | {"multiprocessing_context": None, "prefetch_factor": None})
 
     number = torch.get_num_threads()
     ablations = dict(ABLATIONS)

@@ -20,11 +20,15 @@ import pytest
 import torch
 from clips import write_clip, write_dataset
 from golden import TINY
-from runs import same_weights, settings, small_network
+from runs import TINY as NETWORKS
+from runs import same_weights, settings, small_network, tiny, tiny_settings
 from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from quiver.evaluation import metrics
+from quiver.evaluation.macs import macs
 from quiver.model.blocks import RADIUS, Output
+from quiver.model.presets import build
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNetConfig
 from quiver.model.weights import load, metadata_of
@@ -378,23 +382,130 @@ def two_processes(folder: Path, program: str) -> None:
     assert [process.wait(timeout=300) for process in workers] == [0, 0]
 
 
+def close_weights(a: nn.Module, b: nn.Module) -> None:
+    """Compare weights to the rounding of sums in another order."""
+    for ours, theirs in zip(a.state_dict().values(), b.state_dict().values(), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", [name for name in NETWORKS if name not in ("memdeblur", "fastdvdnet")])
+def test_parts_of_a_batch_add_up_to_it(tiny_dataset, tmp_path, name):
+    """Losses are means over windows; MemDeblur and FastDVDnet normalise over those that they see at once."""
+    found = {}
+    for parts in (1, 2, 4):
+        network = tiny(name)
+        asked = tiny_settings(network, tiny_dataset, tmp_path / str(parts), batch=4, accumulate=parts, steps=1)
+        found[parts] = network, train(network, asked, progress=False)
+    for parts in (2, 4):
+        close_weights(found[1][0], found[parts][0])
+        losses = [found[n][1].history[-1]["loss"] for n in (1, parts)]
+        assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+
+
+def test_parts_of_a_batch_are_equal(tiny_dataset, tmp_path):
+    with pytest.raises(ValueError, match="batch=4: is no multiple of accumulate=3, and parts of a batch are equal"):
+        settings(tiny_dataset, tmp_path, batch=4, accumulate=3)
+
+
+def test_all_restored_frames_of_a_long_window_are_learned_from(tmp_path):
+    """Of 21 frames QUIVER restores eleven in one call, and the target of each has a gradient."""
+    network = QUIVER(TINY)
+    called = []
+    network.register_forward_hook(lambda module, given, output: called.append(output.scale1.shape[1]))
+    target = torch.rand(1, 21, 1, 16, 16, requires_grad=True)
+    batch = {"codes": torch.rand(1, 21, 1, 16, 16), "target": target}
+    quiet = replace(settings(tmp_path, tmp_path, frames=21, loss="l1"))
+    system_of(network).loss(network, batch, quiet, 0.0).backward()
+    assert called == [11]
+    learned = target.grad.abs().sum((0, 2, 3, 4)) > 0
+    assert learned.tolist() == [RADIUS <= t < 21 - RADIUS for t in range(21)]
+
+
+def test_long_windows_share_work():
+    """Multiply-adds per restored pixel of `quiver-s`: 16.1 million where a window gives one frame, 3.7 where eleven."""
+    with FakeTensorMode():
+        network = build("quiver-s")
+        each = {frames: macs(network, frames, 64, 64) / ((frames - 10) * 64**2) for frames in (11, 21, 41)}
+    assert {frames: round(count / 1e6, 1) for frames, count in each.items()} == {11: 16.1, 21: 3.7, 41: 2.9}
+
+
 @pytest.mark.slow
-def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path):
-    """torchrun with gloo averages gradients over both shares: weights agree with a batch of four to rounding."""
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("kind", ["kernels", "graphs"])
+def test_a_compiled_network_learns_the_same(tiny_dataset, tmp_path, kind):
+    plain = tiny("mergenet")
+    compiled = tiny("mergenet")
+    short = {"steps": 2}
+    train(plain, tiny_settings(plain, tiny_dataset, tmp_path / "a", **short), progress=False)
+    said = list[str]()
+    asked = tiny_settings(compiled, tiny_dataset, tmp_path / "b", **short, compile=kind)
+    train(compiled, asked, progress=False, note=said.append)
+    assert not [line for line in said if "compile" in line]
+    close_weights(plain, compiled)
+    assert list(load(tmp_path / "b/last.safetensors").state_dict()) == list(plain.state_dict())
+
+
+def test_what_does_not_compile_trains_without_it(tiny_dataset, tmp_path, monkeypatch):
+    """With one line, and the weights of a run that never tried."""
+
+    def broken(network: nn.Module, mode: str) -> object:
+        def called(*words: object) -> object:
+            torch.rand(3)
+            raise RuntimeError("no compiler\nlong trace")
+
+        return called
+
+    monkeypatch.setattr(torch, "compile", broken)
+    reasons = {
+        "quiver": "torch.compile does not work here, so the network is not compiled: no compiler",
+        "unet": "the loss of this network calls its parts one by one, so it is not compiled",
+    }
+    for name, reason in reasons.items():
+        plain = tiny(name)
+        tried = tiny(name)
+        train(plain, settings(tiny_dataset, tmp_path / f"{name}-a", steps=2), progress=False)
+        said = list[str]()
+        asked = settings(tiny_dataset, tmp_path / f"{name}-b", steps=2, compile="kernels")
+        train(tried, asked, progress=False, note=said.append)
+        assert [line for line in said if "compile" in line] == [reason]
+        assert same_weights(plain, tried)
+
+
+def test_the_number_of_workers_follows_the_device(monkeypatch):
+    """None beside a CPU that trains; for a GPU most cores, shared by the processes of a machine."""
+    monkeypatch.setattr(training.threads, "cores", lambda: 12)
+    alone = Process(0, 1, torch.device("cpu"))
+    assert [training.drawing_processes(asked, alone) for asked in (None, 0, 5)] == [0, 0, 5]
+    monkeypatch.setattr(training, "is_gpu", lambda device: True)
+    assert [training.drawing_processes(asked, alone) for asked in (None, 0, 5)] == [11, 0, 5]
+    assert training.drawing_processes(None, Process(1, 4, torch.device("cpu"))) == 2
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")  # of eight processes on four machines
+    assert training.drawing_processes(None, Process(1, 8, torch.device("cpu"))) == 5
+    monkeypatch.setattr(training.threads, "cores", lambda: 1)
+    assert training.drawing_processes(None, alone) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("parts", "ahead"), [(1, 0), (2, 0), (2, 2)])
+def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path, parts, ahead):
+    """torchrun with gloo averages gradients over both shares: weights agree with a batch of four to rounding.
+
+    So they do where each process computes its share in parts, and where it reads the numbers of a step later.
+    """
     alone = small_network()
     train(alone, settings(tiny_dataset, tmp_path / "a", batch=4, steps=3), progress=False)
     two_processes(
         tmp_path,
         "import torch\n"
+        "from quiver.training import loop\n"
         "from quiver.training.settings import Settings\nfrom quiver.training.loop import train\n"
         "from quiver.model.unet import UNet, UNetConfig\n"
         "torch.set_num_threads(1)\ntorch.manual_seed(0)\n"
+        f"loop.steps_ahead = lambda device: {ahead}\n"
         f"train(UNet(UNetConfig(4)), Settings({str(tiny_dataset)!r}, {str(tmp_path / 'b')!r}, steps=3, crop=16,"
-        " batch=2, validate_every=4, warmup=2, validation_windows=2), progress=False)\n",
+        f" batch=2, accumulate={parts}, validate_every=4, warmup=2, validation_windows=2), progress=False)\n",
     )
-    together = load(tmp_path / "b/last.safetensors")
-    for ours, theirs in zip(alone.state_dict().values(), together.state_dict().values(), strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+    close_weights(alone, load(tmp_path / "b/last.safetensors"))
 
 
 @pytest.mark.slow
