@@ -20,6 +20,7 @@ from quiver.baselines import curves
 from quiver.baselines.curves import Curves, Place
 from quiver.baselines.information_domain import FLOOR, InformationDomain
 from quiver.baselines.paths.moved_frames import SCALES
+from quiver.device import is_gpu
 
 CODE_BITS = 9  # places per octave of mean codes: 2^bits
 LIGHT_BITS = 10  # of phi, towards whose end light rises fast
@@ -85,9 +86,13 @@ def _starts(table: Tensor) -> Tensor:
     return torch.arange(len(table), dtype=torch.int32, device=table.device)[:, None, None] * table.shape[1]
 
 
-@lru_cache(maxsize=64)
 def domain_tables(domain: InformationDomain, device: torch.device) -> DomainTables:
-    """Return the tables of one sensor on a device; made once."""
+    """Return the tables of one sensor on a device, some 2 MB; those that were used last are kept there."""
+    return (_on_gpu if is_gpu(device) else _on_cpu)(domain, device)
+
+
+def _made(domain: InformationDomain, device: torch.device) -> DomainTables:
+    """Return the tables of one sensor on a device."""
     pooled = {}
     for scale in SCALES:
         numbers = scale**2 * domain.top + 1
@@ -103,6 +108,10 @@ def domain_tables(domain: InformationDomain, device: torch.device) -> DomainTabl
         slope,
         pooled,
     )
+
+
+_on_cpu = lru_cache(maxsize=64)(_made)
+_on_gpu = lru_cache(maxsize=512)(_made)  # a training on many sensors and levels of light needs all of them in turn
 
 
 def tables_of_batch(domains: Sequence[InformationDomain], device: torch.device) -> DomainTables:

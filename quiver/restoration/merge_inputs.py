@@ -8,16 +8,17 @@ merged frames are, for a batch of windows at once.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from quiver.baselines.domain_tables import DomainTables, domain_tables
+from quiver.baselines.domain_tables import DomainTables, domain_tables, tables_of_batch
 from quiver.baselines.information_domain import InformationDomain, information_domain
 from quiver.baselines.path_merge import Merged, as_codes, merge, prepared
 from quiver.baselines.paths.moved_frames import box_mean
-from quiver.data.codes import Codes
+from quiver.data.codes import Codes, Sensor
 
 LOCAL = 8  # px: half the side of the squares whose mean code tells the local level
 NEARBY = 2  # px, likewise, of the level around a pixel, and of the noise of groups
@@ -44,6 +45,14 @@ def middle_inputs(codes: Codes) -> tuple[MergeInputs, InformationDomain]:
     domain = information_domain(codes.sensor, codes.exposure)
     window = as_codes(codes.read(0, codes.shape[0])[None], torch.device("cpu"))
     return inputs_of_windows(window, domain_tables(domain, window.device)), domain
+
+
+def batch_inputs(codes: Tensor, sensors: Sequence[tuple[Sensor, float]]) -> tuple[MergeInputs, list[InformationDomain]]:
+    """Return the inputs of the middle frames of windows of codes [B, K, H, W] where the codes are, and the tables of
+    the sensor and exposure [s] of each window.
+    """
+    domains = [information_domain(sensor, exposure) for sensor, exposure in sensors]
+    return inputs_of_windows(codes, tables_of_batch(domains, codes.device)), domains
 
 
 def inputs_of_windows(codes: Tensor, tables: DomainTables) -> MergeInputs:

@@ -25,7 +25,7 @@ from typing import Any, NoReturn
 
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Subset, default_collate
+from torch.utils.data import DataLoader, Subset
 from tqdm import tqdm
 
 from qsim.keys import Key
@@ -49,7 +49,7 @@ from quiver.training.saving import CHECKPOINT_SECONDS, first_line
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
 from quiver.training.self_supervised import make_stream_windows
 from quiver.training.settings import Settings, settled
-from quiver.training.system import Batch, Objective, System
+from quiver.training.system import Batch, Objective, System, collated
 from quiver.training.systems import OURS, system_of
 
 AnyWindows = Windows | StreamWindows
@@ -114,6 +114,7 @@ def batches(windows: AnyWindows, settings: Settings, state: State, process: Proc
         num_workers=workers,
         multiprocessing_context="spawn" if workers else None,
         prefetch_factor=PREFETCHED if workers else None,
+        collate_fn=collated,
         worker_init_fn=begin_worker,
         generator=torch.Generator(),  # separate: the loader must not change the global random state
         pin_memory=is_gpu(process.device),
@@ -176,7 +177,7 @@ def validate(
     picture = torch.zeros(1, 1)
     for i in range(len(windows)):
         sample = windows[i]
-        restored, first = system.restored(model, on_device(default_collate([sample]), device))
+        restored, first = system.restored(model, system.with_inputs(on_device(collated([sample]), device)))
         output = restored[0].float().cpu().squeeze(1)  # bands of one frame are scored together
         target = sample["target"][first : first + len(output)].squeeze(1)
         if not bool(torch.isfinite(output).all()):
@@ -268,7 +269,7 @@ class Trainer:
         if self.process.world > 1:  # the stored random state is the leader's: every process draws from its samples
             torch.manual_seed(Key(settings.seed, int(batch["sample"][0])).philox_key >> 1)
         self.rate = learning_rate(settings, state)
-        moved_batch = on_device(batch, device)
+        moved_batch = self.system.with_inputs(on_device(batch, device))
         if self.parallel is None:
             self.parallel = self._ready(moved_batch)
         before = self._copy() if self.ahead else None
@@ -457,7 +458,7 @@ def train(
             settings, lines = settled(settings, force=force)
             settings = replace(settings, threads=threads.use(asked, settings.threads).number)
             model = for_bands(model, settings)
-            system = system_of(model)
+            system = system_of(model).on(process.device)
             system.refuse(model, settings)
             validated = system.validated(model, settings)
             windows, fixed = make_windows(settings, system.side(model), system, validated, system.window(model))

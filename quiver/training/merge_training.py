@@ -8,7 +8,8 @@ one; otherwise the dimmest would own the gradient. Above the peak the clamp keep
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -16,10 +17,11 @@ from torch import Tensor, nn
 
 from quiver.data.codes import Codes
 from quiver.model.blocks import WINDOW
-from quiver.restoration.merge_inputs import middle_inputs
+from quiver.restoration.merge_inputs import InformationDomain, batch_inputs, middle_inputs
 from quiver.training.settings import Protocol, Settings
-from quiver.training.system import Batch
+from quiver.training.system import Batch, SeenBy
 
+KEPT = 256  # sensors whose tables stay on a device
 NODES = 1024  # of the table from phi to light, evenly spaced in phi
 FLOOR = 2e-6  # added to a mean squared error: 57 dB
 ABOVE = 0.05  # slope of light above the peak
@@ -48,15 +50,38 @@ def check(network: nn.Module, settings: Settings) -> None:
 def prepare(codes: Codes) -> dict[str, Tensor]:
     """Return the inputs of the middle frame of a window, and the table from phi to light over white."""
     inputs, domain = middle_inputs(codes)
-    top = float(domain.phi[-1])
-    table = np.interp(np.linspace(0, top, NODES), domain.phi, domain.photons) / codes.white
+    top, table = light_table(domain, codes.white, torch.device("cpu"))
     return {
         "channels": inputs.channels[0],
         "phi": inputs.phi[0],
         "deviation": inputs.deviation[0],
-        "top": torch.tensor(top, dtype=torch.float32),
-        "table": torch.from_numpy(table.astype(np.float32)),
+        "top": top,
+        "table": table,
     }
+
+
+@torch.no_grad()
+def prepare_batch(codes: Tensor, sensors: Sequence[SeenBy]) -> dict[str, Tensor]:
+    """Return what `prepare` does for windows of codes [B, T, h, w] at once, on their device."""
+    inputs, domains = batch_inputs(codes, [(seen.sensor, seen.exposure) for seen in sensors])
+    ends = [_light_table(domain, seen.white, codes.device) for domain, seen in zip(domains, sensors, strict=True)]
+    return {
+        "channels": inputs.channels,
+        "phi": inputs.phi,
+        "deviation": inputs.deviation,
+        "top": torch.stack([top for top, _ in ends]),
+        "table": torch.stack([table for _, table in ends]),
+    }
+
+
+def light_table(domain: InformationDomain, white: float, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the largest phi of a sensor, a scalar, and its light over white [NODES] over phi from 0 to there."""
+    top = float(domain.phi[-1])
+    table = np.interp(np.linspace(0, top, NODES), domain.phi, domain.photons) / white
+    return torch.tensor(top, dtype=torch.float32).to(device), torch.from_numpy(table.astype(np.float32)).to(device)
+
+
+_light_table = lru_cache(maxsize=KEPT)(light_table)  # of the sensors of a training
 
 
 def light_of(phi: Tensor, top: Tensor, table: Tensor) -> Tensor:

@@ -48,6 +48,7 @@ def mosaic_system(core: System, network: MosaicNet) -> System:
         frames=core.window(network.core),
         multiple=core.side(network.core) * math.lcm(*network.config.tile),
         prepare=partial(prepare, core.prepare),
+        prepare_batch=None,
         check=partial(_check, core),
     )
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor, nn
+from torch.utils.data import default_collate
 
+from quiver.data.codes import Codes, Sensor
 from quiver.data.windows import Prepare
+from quiver.device import is_gpu
 from quiver.training.settings import Protocol, Settings
 
 Batch = Mapping[str, Any]  # of samples from `Windows`: codes and target [B, T, 1, h, w], and what `prepare` adds
@@ -18,6 +22,36 @@ Loss = Callable[[nn.Module, Batch, Settings, float], Tensor]
 
 # (network, batch) -> restored frames [B, n, 1, h, w] in units of white, and the place of the first in the window
 Restored = Callable[[nn.Module, Batch], tuple[Tensor, int]]
+
+
+# The sensors of the windows of a batch, a list: of inputs that are made on the device
+SENSORS = "sensors"
+TOP = "top code"  # of each of them
+
+
+@dataclass(frozen=True)
+class SeenBy:
+    """What saw a window: all that inputs need to know beside its codes."""
+
+    sensor: Sensor
+    exposure: float  # s
+    white: float  # photons
+
+
+def seen_by(codes: Codes) -> dict[str, Any]:
+    """Return the sensor of a window, in place of inputs: those are made of the complete batch."""
+    top = torch.tensor(codes.sensor.levels - 1, dtype=torch.float32)
+    return {SENSORS: SeenBy(codes.sensor, codes.exposure, codes.white), TOP: top}
+
+
+# Inputs of a batch on its device: (codes [B, T, h, w] in whole numbers, the sensor of each window) -> name -> tensor
+PrepareBatch = Callable[[Tensor, Sequence[SeenBy]], Mapping[str, Tensor]]
+
+
+def collated(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return a batch of samples; their sensors stay a list."""
+    batch = default_collate([{name: value for name, value in one.items() if name != SENSORS} for one in samples])
+    return batch | ({SENSORS: [one[SENSORS] for one in samples]} if SENSORS in samples[0] else {})
 
 
 def nothing_to_refuse(network: nn.Module, settings: Settings) -> None:
@@ -42,10 +76,28 @@ class System:
     as_long: bool = False  # validations see as many frames as training: a state that grows over them is told
     multiple: int | None = None  # px that divides the side of a crop; None: the network's own `multiple`, else 1
     prepare: Prepare | None = None  # computes more inputs where samples are drawn
+    prepare_batch: PrepareBatch | None = None  # computes the same inputs of a batch on a device
     still: bool = False  # samples also hold noisy copies of the centre frame
     of_stream: bool = False  # learns from the frames of one stored stream, without truth or validation
     begins: Callable[[nn.Module], float] = at_once  # share of a run after which the scored part learns
     check: Callable[[nn.Module, Settings], None] = nothing_to_refuse  # ValueError for settings that do not fit
+
+    def on(self, device: torch.device) -> System:
+        """Return how the network is trained on a device: on a GPU inputs are made there, of a complete batch.
+
+        On a CPU they are made where samples are drawn, and `prepare_batch` is None.
+        """
+        if self.prepare_batch is None or not is_gpu(device):
+            return replace(self, prepare_batch=None)
+        return replace(self, prepare=seen_by)
+
+    def with_inputs(self, batch: Batch) -> Batch:
+        """Return a batch on its device with the inputs that are made there."""
+        if self.prepare_batch is None:
+            return batch
+        codes = (batch["codes"][:, :, 0] * batch[TOP][:, None, None, None]).round_()
+        own = {name: value for name, value in batch.items() if name not in (SENSORS, TOP)}
+        return own | dict(self.prepare_batch(codes, batch[SENSORS]))
 
     def window(self, network: nn.Module) -> int:
         """Return the least number of frames of a window: the network's own `frames_in`, if it has one."""

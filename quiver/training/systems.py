@@ -101,6 +101,7 @@ SYSTEMS: dict[type[nn.Module], System] = {
         protocols=merging.PROTOCOLS,
         multiple=8,
         prepare=merging.prepare,
+        prepare_batch=merging.prepare_batch,
         check=merging.check,
     ),
     UNet: replace(OURS, name="unet", loss=unet_loss, restored=rivals.windows_restored),

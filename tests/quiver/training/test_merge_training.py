@@ -1,21 +1,29 @@
 """Training of MergeNet: inputs of a window, the table from phi to light, and a loss in decibels."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from merge_windows import random_sensor, window_of
+from operators import Operators
 from torch.utils.data import default_collate
 
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines.information_domain import information_domain
 from quiver.data.codes import array_codes
+from quiver.data.windows import as_input
 from quiver.model.mergenet import MergeNet, MergeNetConfig
 from quiver.model.presets import build
+from quiver.model.unet import UNet
 from quiver.training import merge_training as mt
+from quiver.training import system as training_system
+from quiver.training.loop import train
 from quiver.training.settings import Settings
-from quiver.training.systems import system_of
+from quiver.training.system import SENSORS, TOP, SeenBy, collated, seen_by
+from quiver.training.systems import SYSTEMS, system_of
 
 EXPOSURE = 5e-4
 
@@ -71,6 +79,62 @@ def test_training_lowers_the_loss():
         losses[-1].backward()
         optimiser.step()
     assert losses[-1].item() < losses[0].item() - 0.01
+
+
+def test_inputs_of_a_batch_are_those_of_its_windows():
+    """Over sensors and bits. In the batch codes are over the top code, as samples have them."""
+    rng = np.random.default_rng(2)
+    sensors = [random_sensor(rng) for _ in range(6)]
+    codes = [window_of(rng, sensor, (11, 40, 48)) for sensor in sensors]
+    windows = [array_codes(one, sensor, EXPOSURE) for one, sensor in zip(codes, sensors, strict=True)]
+    alone = collated([mt.prepare(window) for window in windows])
+    samples = [{"codes": as_input(one, sensor)} for one, sensor in zip(codes, sensors, strict=True)]
+    batch = collated([one | seen_by(window) for one, window in zip(samples, windows, strict=True)])
+    together = replace(SYSTEMS[MergeNet], prepare=seen_by).with_inputs(batch)
+    assert set(together) == {"codes", *alone}
+    for name, values in alone.items():
+        torch.testing.assert_close(together[name], values, rtol=1e-5, atol=1e-4 if name == "channels" else 1e-5)
+
+
+def test_inputs_are_made_on_a_gpu_alone(monkeypatch):
+    system = SYSTEMS[MergeNet]
+    here = system.on(torch.device("cpu"))
+    assert (here.prepare, here.prepare_batch) == (mt.prepare, None)
+    assert here.with_inputs({"codes": torch.zeros(1)}) == {"codes": torch.zeros(1)}
+    monkeypatch.setattr(training_system, "is_gpu", lambda device: True)
+    there = system.on(torch.device("cpu"))
+    assert (there.prepare, there.prepare_batch) == (seen_by, mt.prepare_batch)
+    other = SYSTEMS[UNet].on(torch.device("cpu"))
+    assert (other.prepare, other.prepare_batch) == (None, None)
+
+
+@pytest.mark.parametrize("device", ["cpu", "meta"])
+def test_the_inputs_of_a_batch_wait_for_nothing(device):
+    """From the second batch on, when the tables of its sensors are there."""
+    sensors = [QIS(0.8, 1.6, 0.2, 3), BinarySPAD(1.0, 0.0, 1)]
+    system = replace(SYSTEMS[MergeNet], prepare=seen_by)
+    batch = {
+        "codes": torch.zeros(2, 11, 1, 40, 48, device=device),
+        SENSORS: [SeenBy(sensor, EXPOSURE, sensor.white(EXPOSURE)) for sensor in sensors],
+        TOP: torch.ones(2, device=device),
+    }
+    system.with_inputs(batch)
+    with Operators() as operators:
+        system.with_inputs(batch)
+    assert not operators.waits
+
+
+def test_a_run_whose_inputs_are_made_on_the_device_learns_the_same(tiny_dataset, tmp_path, monkeypatch):
+    """The CPU takes the place of the GPU; weights after some steps are those of inputs that workers make."""
+    weights = []
+    for name in ("workers", "device"):
+        torch.manual_seed(0)
+        network = MergeNet(MergeNetConfig(4))
+        settings = Settings(str(tiny_dataset), str(tmp_path / name), steps=3, crop=16, batch=2, loss="own")
+        train(network, settings, progress=False)
+        weights.append(torch.cat([value.flatten() for value in network.state_dict().values()]))
+        monkeypatch.setattr(training_system, "is_gpu", lambda device: True)
+    torch.testing.assert_close(weights[0], weights[1], rtol=0, atol=1e-5)
 
 
 def test_the_loop_knows_the_system():
