@@ -18,25 +18,23 @@ from qsim.device_lock import one_thread_in_order
 from qsim.keys import require_counters
 from qsim.sensor.distribution import check_exposure
 from qsim.sensor.row import Row
-from qsim.sensor.sensor import fast_engine_works
+from qsim.sensor.sensor import MOST_PIXELS, fast_engine_works
 
 LIGHT = {"float16": "f16", "float32": "f", "float64": "f64"}  # types of light, and their names in Dr.Jit
-LARGEST = 1 << 31  # numbers of a batch
 
 
 @one_thread_in_order
-def draw_rows(light: Any, shape: tuple[int, int, int, int], rows: Sequence[Row], *, aligned: bool = False) -> Any:
+def draw_rows(light: Any, shape: tuple[int, int, int, int], rows: Sequence[Row]) -> Any:
     """Return codes as Dr.Jit's Int32 [B T H ceil(W / 4)] on the device: four in a number, the first one lowest.
 
     `light` holds the B T H W numbers of `shape` in a line, float16, float32 or float64: a NumPy array, or one of a
-    library that knows DLPack, which stays on its device. `aligned`: memory of the other library begins at a multiple
-    of 64 bytes; other memory may need a kernel of its own. Light is finite and not negative: nobody looks at it, and
+    library that knows DLPack, which stays on its device. Light is finite and not negative: nobody looks at it, and
     codes of other light have no meaning.
     `ValueError` for rows that do not fit the shape, for a sensor whose law no table holds, and for a machine without a
     compiled engine.
     """
     kind = LIGHT.get(str(light.dtype).rpartition(".")[2])
-    if len(shape) != 4 or not 0 < prod(shape) <= LARGEST or tuple(light.shape) != (prod(shape),) or kind is None:
+    if len(shape) != 4 or not 0 < prod(shape) <= MOST_PIXELS or tuple(light.shape) != (prod(shape),) or kind is None:
         wanted = "light has the shape [B, T, H, W] in float16, float32 or float64, 1 to 2^31 numbers"
         raise ValueError(f"{wanted}; got {list(shape)} in {light.dtype}")
     if len(rows) != shape[0]:
@@ -50,11 +48,13 @@ def draw_rows(light: Any, shape: tuple[int, int, int, int], rows: Sequence[Row],
         from qsim.sensor.compiled import draw_rows as compiled
         from qsim.sensor.compiled import jit
 
-        missing = [row.sensor for row in rows if compiled.law_of(row) is None]
-        if missing:
-            raise ValueError(f"{missing[0]!r}: no table holds the law of its codes; use `sample`")
+        draws = []
+        for row in rows:
+            draw = row.sensor.device_draw(row.exposure, row.key, row.origin, row.scale, row.at_once)
+            if draw is None:
+                raise ValueError(f"{row.sensor!r}: no table holds the law of its codes; use `sample`")
+            draws.append(draw)
         if jit.available():
-            if isinstance(light, np.ndarray):
-                return compiled.draw(jit.in_aligned(light), kind, True, shape, rows)
-            return compiled.draw(light, kind, aligned, shape, rows)
+            given = jit.in_aligned(light) if isinstance(light, np.ndarray) else light
+            return compiled.draw(given, kind, shape, draws)
     raise ValueError("no compiled engine draws codes on this machine; use `sample`")

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, fields
 from functools import cache, lru_cache
 from math import prod
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy import ndarray as Array
@@ -22,13 +22,17 @@ from qsim import plugins
 from qsim.arrays import plain
 from qsim.keys import Key, require_counters, words, words_at
 from qsim.sensor import estimation
-from qsim.sensor.compiled.plan import Plan
+from qsim.sensor.compiled.plan import MOST_BITS, Plan
 from qsim.sensor.distribution import Distribution, check_exposure
 from qsim.sensor.estimation import Estimate, Response
 from qsim.sensor.packing import pack
 
+if TYPE_CHECKING:
+    from qsim.sensor.compiled.draw_rows import Draw
+
 _CHUNK = 1 << 18  # probabilities in one block of a draw (2 MiB)
 SMALLEST = 1 << 14  # pixels of a compiled draw; for fewer, compiling costs more than it saves
+MOST_PIXELS = 1 << 31  # of a draw on the device
 ENGINES = ("auto", "reference", "fast")
 _UNITS = {
     "quantum_efficiency": "e-/photon",
@@ -213,26 +217,36 @@ class Sensor(Distribution):
         """
         photons = plain(photons) if isinstance(photons, np.ndarray) else photons
         shape = tuple(map(int, photons.shape))
-        plan = None
         check_exposure(exposure)
-        if len(shape) != 3 or not 0 < prod(shape) < 1 << 32 or "float32" not in str(photons.dtype):
-            wanted = "photons have the shape [T, H, W] in float32, 1 to 2^32 - 1 of them"
+        if len(shape) != 3 or not 0 < prod(shape) <= MOST_PIXELS or "float32" not in str(photons.dtype):
+            wanted = "photons have the shape [T, H, W] in float32, 1 to 2^31 of them"
             raise ValueError(f"{wanted}; got {list(shape)} in {photons.dtype}")
         require_counters(key, shape, origin, self.counters)
         if fast_engine_works():
-            from qsim.sensor.compiled import jit
+            from qsim.sensor.compiled import jit, on_device
 
-            plan = plan_of(self, exposure) if jit.available() else None
-        if plan is None:
-            raise ValueError(f"{self!r}: no compiled engine draws its codes on this machine; use `sample`")
-        from qsim.sensor.compiled import on_device
+            row = self.device_draw(exposure, key, origin)
+            if row is not None and jit.available():
+                return on_device.sample(photons.reshape(-1), shape, row, _refuse_wrong)
+        raise ValueError(f"{self!r}: no compiled engine draws its codes on this machine; use `sample`")
 
-        def exact(light: Array, pixels: Array) -> Array:
-            _refuse_wrong(light, pixels)
-            at = pixels + np.array([[key.frame], [origin[0]], [origin[1]]])
-            return self.draw_at(light.astype(np.float64), exposure, key=key, at=at)
+    def device_draw(
+        self, exposure: float, key: Key, origin: tuple[int, int], scale: float = 1.0, at_once: bool = False
+    ) -> Draw | None:
+        """Return how a kernel draws a row of a batch (rows.py); None without a table of the law.
 
-        return on_device.sample(plan, photons.reshape(-1), shape, key, origin, exact)
+        `at_once`: a sum of planes is drawn from one number per pixel.
+        """
+        from qsim.sensor.compiled.draw_rows import Draw
+        from qsim.sensor.compiled.row_tables import has_table
+
+        drawn = self if at_once else self.plane
+        law = (drawn, exposure if drawn.law_follows_exposure else 1.0)
+        if not self.tabulated or self.bits > MOST_BITS or not has_table(law):
+            return None
+        planes = 1 if at_once else self.counters
+        efficiency = scale * self.efficiency / planes
+        return Draw(law, efficiency, self.dark_rate * exposure / planes, planes, key, origin)
 
     def draw_at(self, photons: Array, exposure: float, *, key: Key, at: Array) -> Array:
         """Return the reference's codes [p] of single pixels: photons [p], `at` int [3, p] = (frame, row, column).

@@ -43,9 +43,9 @@ def codes_of_rows(light: Tensor, rows: Sequence[Row]) -> Tensor:
         raise ValueError(f"light has the shape [B, T, H, W], got {list(light.shape)}")
     shape = tuple(light.shape)
     given = light.detach().contiguous().reshape(-1)
-    if given.data_ptr() % _ALIGNED:
+    if given.data_ptr() % _ALIGNED:  # other memory needs another kernel
         given = given.clone()
     follow(given.device)
-    drawn = draw_rows(given, (shape[0], shape[1], shape[2], shape[3]), rows, aligned=True)
+    drawn = draw_rows(given, (shape[0], shape[1], shape[2], shape[3]), rows)
     codes = torch.from_dlpack(drawn).view(torch.uint8).reshape(*shape[:3], -1)
     return codes[..., : shape[3]]

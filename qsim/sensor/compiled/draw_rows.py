@@ -1,64 +1,63 @@
-"""Draws a batch of rows (rows.py): looks up their laws, writes a record for each and launches rows_kernel.py once."""
+"""Draws a batch of rows: looks up their laws, writes a record for each and launches rows_kernel.py once."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from qsim.keys import Key
 from qsim.sensor.compiled import rows_kernel
-from qsim.sensor.compiled.jit import aligned, backend
+from qsim.sensor.compiled.jit import aligned, backend, is_aligned
 from qsim.sensor.compiled.row_tables import Law, table_of, tables
-from qsim.sensor.row import Row
 
 
-def law_of(row: Row) -> Law | None:
-    """Return the law of the number that a row draws for each pixel, or for each plane of one; None without a table."""
-    sensor = row.sensor
-    if not sensor.tabulated or sensor.bits > 8:
-        return None
-    drawn = sensor if row.at_once else sensor.plane
-    law = (drawn, row.exposure if drawn.law_follows_exposure else 1.0)
-    return None if table_of(law) is None else law
+@dataclass(frozen=True)
+class Draw:
+    """How a kernel draws one row, [T, H, W] of light."""
+
+    law: Law  # that has a table, of the number of a pixel, or of each plane of one
+    efficiency: float  # arrivals per unit of light, of one number
+    dark: float  # arrivals without light, of one number
+    planes: int  # numbers whose codes are summed
+    key: Key
+    origin: tuple[int, int]
 
 
-def draw(light: Any, kind: str, whole: bool, shape: tuple[int, int, int, int], rows: Sequence[Row]) -> Any:
-    """Return codes Int32 [B T H ceil(W / 4)]; `kind` of light as in `rows_kernel.kernel`.
+def draw(light: Any, kind: str, shape: tuple[int, int, int, int], draws: Sequence[Draw]) -> Any:
+    """Return codes Int32 [B T H ceil(W / 4)], four in a number.
 
-    `whole`: the memory of the light begins at a multiple of four numbers. Each row has a law.
+    `kind` of light as in `rows_kernel.kernel`.
     """
     jit = backend()
-    laws = [law_of(row) for row in rows]
-    held = tables(max(row.sensor.bits for row in rows))
-    held.hold({law for law in laws if law is not None})
-    records = aligned((len(rows), rows_kernel.RECORD), np.float64)
-    planes = [1 if row.at_once else row.sensor.counters for row in rows]
-    for row, law, count, own in zip(rows, laws, planes, records, strict=True):
-        assert law is not None
-        table = table_of(law)
-        assert table is not None
-        first, cells = held.places[law]
-        y, x = row.origin
+    held = tables(max(each.law[0].bits for each in draws))
+    held.hold({each.law for each in draws})
+    records = aligned((len(draws), rows_kernel.RECORD), np.float64)
+    for each, own in zip(draws, records, strict=True):
+        table = table_of(each.law)
+        first, cells = held.places[each.law]
+        y, x = each.origin
         own[:] = rows_kernel.Record(
-            efficiency=row.scale * row.sensor.efficiency / count,
-            dark=row.sensor.dark_rate * row.exposure / count,
+            efficiency=each.efficiency,
+            dark=each.dark,
             rate=table.rate,
             margin=table.margin,
             first=first,
             last=cells - 1,
-            frame=row.key.frame,
-            planes=count,
+            frame=each.key.frame,
+            planes=each.planes,
             y=y,
             x=x,
-            key=row.key.philox_key,
+            key=each.key.philox_key,
         ).numbers()
     kernel = rows_kernel.kernel(
         bits=held.bits,
         light=kind,
-        summing=max(planes) > 1,
-        shifted=any(row.origin[1] % 4 for row in rows),
-        whole=whole and shape[3] % 4 == 0,
+        summing=any(each.planes > 1 for each in draws),
+        shifted=any(each.origin[1] % 4 for each in draws),
+        whole=shape[3] % 4 == 0 and is_aligned(light),
     )
-    given = getattr(backend(), rows_kernel.LIGHT[kind])(light)
+    given = getattr(jit, rows_kernel.LIGHT[kind])(light)
     return kernel(rows_kernel.places(shape), given, jit.Float64(records.reshape(-1)), held.fast, held.exact)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from functools import cache
-from math import log
+from math import log, prod
 from typing import Any
 
 import numpy as np
@@ -74,15 +74,23 @@ def aligned(shape: tuple[int, ...], kind: Any) -> Array:
 
     Kernels for other memory are other kernels: without this one would be compiled again by chance.
     """
-    size = int(np.prod(shape)) * np.dtype(kind).itemsize
+    size = prod(shape) * np.dtype(kind).itemsize
     memory = np.empty(size + ALIGNED, np.uint8)
     first = -memory.ctypes.data % ALIGNED
     return memory[first : first + size].view(kind).reshape(shape)
 
 
+def is_aligned(numbers: Any) -> bool:
+    """Return whether an array's memory begins as that of `aligned`; of arrays that tell no address it is not known."""
+    if isinstance(numbers, np.ndarray):
+        return numbers.ctypes.data % ALIGNED == 0
+    address = getattr(numbers, "data_ptr", None)  # torch
+    return address is not None and address() % ALIGNED == 0
+
+
 def in_aligned(numbers: Array) -> Array:
     """Return the same numbers in memory as of `aligned`; without a copy where they are there."""
-    if numbers.ctypes.data % ALIGNED == 0 and numbers.flags.c_contiguous:
+    if is_aligned(numbers) and numbers.flags.c_contiguous:
         return numbers
     found = aligned(numbers.shape, numbers.dtype)
     found[...] = numbers

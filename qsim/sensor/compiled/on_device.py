@@ -1,92 +1,56 @@
-"""Draws clips by the compiled engine into the memory of the device: codes for torch, by DLPack, past the host.
+"""Draws a clip into the memory of the device as bytes: codes for torch, by DLPack, past the host.
 
-    photons on the device or host -> pairs of photons -> kernel.py -> codes, one byte each, on the device
-
-The codes equal those of launch.py for the same float32 photons. Of the pixels that float32 cannot decide (about 40 in
-a million), indices and photons go to the host and codes come back; nothing else does.
+photons on the device or host -> one row of draw_rows.py -> codes, one byte each, on the device
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.device_lock import one_thread_at_a_time
-from qsim.keys import Key
-from qsim.sensor.compiled.jit import backend
-from qsim.sensor.compiled.kernel import fixed_scalars, start
-from qsim.sensor.compiled.launch import LARGEST
-from qsim.sensor.compiled.plan import Plan
+from qsim.sensor.compiled.draw_rows import Draw, draw
+from qsim.sensor.compiled.jit import backend, in_aligned, no_light
 
-Exact = Callable[[Array, Array], Array]  # photons float32 [p], pixels int [3, p] = (t, y, x) -> the reference's codes
+Refuse = Callable[[Array, Array], None]  # photons float32 [p], pixels int [3, p] = (t, y, x): raises for wrong ones
 
 
 @one_thread_at_a_time
-def sample(
-    plan: Plan, photons: Any, shape: tuple[int, int, int], key: Key, origin: tuple[int, int], exact: Exact
-) -> Any:
-    """Return codes as Dr.Jit's tensor uint8 [T, H, W]; frame t is drawn under `key.at(key.frame + t)`.
+def sample(photons: Any, shape: tuple[int, int, int], row: Draw, refuse: Refuse) -> Any:
+    """Return codes as Dr.Jit's tensor uint8 [T, H, W].
 
-    `photons` are float32 [T H W], a NumPy array or one of a library that knows DLPack. `origin` (y, x) places a crop in
-    the full frame; `exact` draws the pixels that the kernel leaves uncertain.
+    `photons` are float32 [T H W], a NumPy array or one of a library that knows DLPack.
     """
     import drjit as dr
 
     jit = backend()
-    light = jit.Float(photons)
-    codes = dr.zeros(jit.UInt8, int(np.prod(shape)))
-    fixed = fixed_scalars(key, origin)
-    for frames, rows, threads in _parts(shape, origin):
-        part = (frames.stop - frames.start, rows.stop - rows.start, threads)
-        places = [_places(part, frames.start, rows.start, shape, origin, side) for side in (0, 1)]
-        pair = [
-            jit.UInt64(dr.reinterpret_array(jit.UInt32, dr.gather(jit.Float, light, at, inside)))
-            for at, inside in places
-        ]
-        both = pair[0] | pair[1] << 32
-        dr.eval(both)
-        out, uncertain = start(plan, both, part, (key.frame + frames.start, origin[0] + rows.start), fixed, None)
-        for side, (index, inside) in enumerate(places):
-            dr.scatter(codes, jit.UInt8(jit.UInt32(out) >> 8 * side & 0xFF), index, inside)
-            undecided: Any = dr.compress((uncertain != 0) & inside)
-            pixels = dr.gather(jit.UInt32, index, undecided)
-            if len(pixels):
-                at = np.stack(np.unravel_index(pixels.numpy(), shape))
-                known = exact(dr.gather(jit.Float, light, pixels).numpy(), at)
-                dr.scatter(codes, jit.UInt8(known.astype(np.uint8)), pixels)
+    given = in_aligned(photons) if isinstance(photons, np.ndarray) else photons
+    light = jit.Float(given)
+    wrong = no_light([light])
+    if dr.any(wrong):
+        pixels: Any = dr.compress(wrong)
+        found: Any = dr.gather(jit.Float, light, pixels)
+        refuse(found.numpy(), np.stack(np.unravel_index(pixels.numpy(), shape)))
+    fours = draw(given, "f", (1, *shape), [row])
+    codes = _bytes(fours, shape)
     dr.eval(codes)
     dr.sync_thread()  # torch has another stream
     return jit.TensorXu8(codes, shape)
 
 
-def _parts(shape: tuple[int, int, int], origin: tuple[int, int]) -> Iterator[tuple[slice, slice, int]]:
-    """Yield the launches of a clip: frames, rows, and threads of a row, in complete Philox blocks of the full frame."""
-    frames, height, width = shape
-    threads = -(-((origin[1] & 3) + width) // 4) * 2
-    rows = min(height, max(1, LARGEST // (2 * threads)))
-    together = min(frames, max(1, LARGEST // (2 * height * threads))) if rows == height else 1
-    for t in range(0, frames, together):
-        for y in range(0, height, rows):
-            yield slice(t, min(t + together, frames)), slice(y, min(y + rows, height)), threads
-
-
-def _places(
-    part: tuple[int, int, int], t: int, y: int, shape: tuple[int, int, int], origin: tuple[int, int], side: int
-) -> tuple[Any, Any]:
-    """Return for each thread of a launch the index of its left or right pixel in [T H W], and whether it exists."""
+def _bytes(fours: Any, shape: tuple[int, int, int]) -> Any:
+    """Return codes UInt8 [T H W] of numbers of four; without a copy on the host where rows are whole fours."""
     import drjit as dr
 
     jit = backend()
-    _, rows, threads = part
-    number = dr.arange(jit.UInt32, int(np.prod(part)))
-    frame = number // (rows * threads)
-    rest = number % (rows * threads)
-    row = rest // threads
-    column = 2 * (rest % threads) + side
-    # Threads begin at a multiple of four columns, as blocks of words do; the first may lie outside the crop.
-    left = origin[1] & 3
-    inside = (column >= left) & (column < left + shape[2])
-    return ((frame + t) * shape[1] + row + y) * shape[2] + column - left, inside
+    width = shape[2]
+    if width % 4 == 0 and dr.backend_v(fours) == dr.JitBackend.LLVM:
+        return jit.UInt8(fours.numpy().view(np.uint8))
+    number = dr.arange(jit.UInt32, int(np.prod(shape)))
+    line = number // width
+    column = number - line * width
+    four = dr.gather(jit.UInt32, jit.UInt32(fours), line * -(-width // 4) + (column >> 2))
+    return jit.UInt8((four >> ((column & 3) * 8)) & 0xFF)

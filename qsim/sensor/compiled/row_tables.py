@@ -10,18 +10,29 @@ from numpy import ndarray as Array
 
 from qsim.sensor.compiled.jit import aligned, backend
 from qsim.sensor.compiled.law_table import LawTable
-from qsim.sensor.sensor import Sensor
+from qsim.sensor.distribution import Distribution
 
 _MOST_LAWS = 64  # held on the device; beyond them those that are not in use are left out
 
-Law = tuple[Sensor, float]  # and the exposure [s]
+Law = tuple[Distribution, float]  # and the exposure [s]
 
 
 @lru_cache(maxsize=2 * _MOST_LAWS)
-def table_of(law: Law) -> LawTable | None:
-    """Return the table of a law, made once; None where it would be too large."""
-    sensor, exposure = law
-    return LawTable.of(sensor, exposure)
+def _made(law: Law) -> LawTable | None:
+    distribution, exposure = law
+    return LawTable.of(distribution, exposure)
+
+
+def has_table(law: Law) -> bool:
+    """Return whether a law has a table; that of some would be too large."""
+    return _made(law) is not None
+
+
+def table_of(law: Law) -> LawTable:
+    """Return the table of a law that has one, made once."""
+    found = _made(law)
+    assert found is not None
+    return found
 
 
 class Tables:
@@ -34,26 +45,26 @@ class Tables:
         self.exact: Any = None
 
     def hold(self, laws: set[Law]) -> None:
-        """Copy the tables of laws to the device, unless they are there; `table_of` has a table for each."""
+        """Copy the tables of laws to the device, unless they are there; each has a table of at most these bits."""
         if laws <= self.places.keys():
             return
         import drjit as dr
 
-        held = [law for law in self.places if len(self.places.keys() | laws) <= _MOST_LAWS or law in laws]
-        held += [law for law in laws if law not in held]
-        tables = [_table(law).padded((1 << self.bits) - 1) for law in held]
-        counts = [len(table.fast) for table in tables]
+        others = [law for law in self.places if law not in laws]
+        held = [*others[: max(0, _MOST_LAWS - len(laws))], *laws]
+        padded = [table_of(law).padded((1 << self.bits) - 1) for law in held]
+        counts = [len(table.fast) for table in padded]
         firsts = np.cumsum([0, *counts[:-1]]).tolist()
         self.places = dict(zip(held, zip(firsts, counts, strict=True), strict=True))
         jit = backend()
-        self.fast = jit.Float(_joined([table.fast for table in tables]))
-        self.exact = jit.Float64(_joined([table.exact for table in tables]))
+        self.fast = jit.Float(_joined([table.fast for table in padded]))
+        self.exact = jit.Float64(_joined([table.exact for table in padded]))
         dr.eval(self.fast, self.exact)
 
 
 @cache
 def tables(bits: int) -> Tables:
-    """Return the tables of this process for codes of so many bits."""
+    """Return the tables of this process for laws of at most so many bits."""
     return Tables(bits)
 
 
@@ -61,9 +72,3 @@ def _joined(parts: list[Array]) -> Array:
     """Return all numbers of some arrays of one type, one behind the other."""
     found = aligned((sum(part.size for part in parts),), parts[0].dtype)
     return np.concatenate([part.ravel() for part in parts], out=found)
-
-
-def _table(law: Law) -> LawTable:
-    found = table_of(law)
-    assert found is not None
-    return found

@@ -10,9 +10,9 @@ thread in float64 with two words, as the reference does. So no pixel goes to the
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,8 +23,7 @@ LIGHT = {"f16": "Float16", "f": "Float", "f64": "Float64"}  # Dr.Jit's types of 
 RECORD = 12  # numbers of a record
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(NamedTuple):
     """What a kernel knows of a row, in the order in which it reads it."""
 
     efficiency: float  # arrivals per unit of light
@@ -41,8 +40,8 @@ class Record:
 
     def numbers(self) -> list[float]:
         """Return the RECORD numbers that a kernel reads."""
-        *others, key = astuple(self)
-        return [*map(float, others), float(key >> 32), float(key & 0xFFFFFFFF)]
+        *others, key = self
+        return [*others, key >> 32, key & 0xFFFFFFFF]
 
 
 @lru_cache(maxsize=2)  # of one loader: full batches, and the last one
@@ -100,17 +99,19 @@ def kernel(bits: int, light: str, summing: bool, shifted: bool, whole: bool) -> 
             at = ((row * frames + t) * height + line) * width + 4 * column
             photons = [dr.gather(one, given, at + n, 4 * column + n < width) for n in range(4)]
         cells = [_Cell.of(jit.Float64(value), law, first, last, bits) for value in photons]
+        middle = [cell.fast(fast, (1 << (bits - 1)) - 1) for cell in cells]  # the same for all planes
         words = _Words(x, column, y + line, high, low, shifted)
         frame += t
 
         def plane(counter: Any) -> Any:
             """Return the codes of one frame, or of one plane of it."""
             now = words.at(counter)
-            codes, near = _codes(cells, [uniform32(word) for word in now], fast, _Cell.fast)
+            codes, near = _codes(cells, [uniform32(word) for word in now], middle, fast, _Cell.fast)
 
             def decided(_: Any) -> tuple[Any]:
-                both = zip(now, words.at(counter, redraw=1), strict=True)
-                return (_codes(cells, [_uniform64(*pair) for pair in both], exact, _Cell.exact)[0],)
+                both = [_uniform64(*pair) for pair in zip(now, words.at(counter, redraw=1), strict=True)]
+                begin = [cell.exact(exact, (1 << (bits - 1)) - 1) for cell in cells]
+                return (_codes(cells, both, begin, exact, _Cell.exact)[0],)
 
             open_ = near < jit.Float(law[3])
             return dr.if_stmt((codes,), open_, decided, lambda codes: (codes,), mode="symbolic")[0]
@@ -134,22 +135,29 @@ def _summed(plane: Callable[[Any], Any], frame: Any, planes: Any) -> Any:
     return total
 
 
-def _codes(cells: list[_Cell], numbers: list[Any], table: Any, step: Callable[..., Any]) -> tuple[Any, Any]:
+def _codes(
+    cells: list[_Cell], numbers: list[Any], middle: list[Any], table: Any, step: Callable[..., Any]
+) -> tuple[Any, Any]:
     """Return how many steps each uniform number has passed, four in one, and the distance to the nearest step.
 
-    `step` returns F of a step of a cell. The steps just before and behind a number are both on the way.
+    `middle` has F of the middle step of each cell, and `step` returns that of another one. The steps just before and
+    behind a number are both on the way.
     """
     import drjit as dr
 
     u32 = backend().UInt32
     joined = u32(0)
     near = type(numbers[0])(1)
-    for n, (cell, u) in enumerate(zip(cells, numbers, strict=True)):
+    for n, (cell, u, value) in enumerate(zip(cells, numbers, middle, strict=True)):
         code = u32(0)
-        for half in (1 << bit for bit in reversed(range(cell.bits))):
-            distance = u - step(cell, table, code + (half - 1))
+        half = 1 << (cell.bits - 1)
+        while half:
+            distance = u - value
             near = smaller(near, dr.abs(distance))
             code += dr.select(distance >= 0, u32(half), u32(0))
+            half //= 2
+            if half:
+                value = step(cell, table, code + (half - 1))
         joined |= code << (8 * n)
     return joined, near
 

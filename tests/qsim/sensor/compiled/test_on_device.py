@@ -5,7 +5,6 @@ import pytest
 from compiled_cases import EXPOSURE, KEY, OTHERS, SENSORS, light, needs_engine, reference
 
 from qsim.keys import Key
-from qsim.sensor.compiled import on_device
 from qsim.sensor.qis import QIS
 
 
@@ -36,15 +35,6 @@ def test_uncertain_pixels_are_drawn_by_the_reference():
     sensor = SENSORS["3 bits, gain 1"]
     photons = light(sensor, (1, 512, 511), seed=1)
     np.testing.assert_array_equal(drawn(sensor, photons), reference(sensor, photons))
-
-
-@needs_engine
-@pytest.mark.parametrize("largest", [60, 500])
-def test_several_launches_make_the_same_clip(monkeypatch, largest):
-    sensor = SENSORS["3 bits, gain 1"]
-    photons = light(sensor, (5, 9, 13))
-    monkeypatch.setattr(on_device, "LARGEST", largest)
-    np.testing.assert_array_equal(drawn(sensor, photons, (3, 6)), reference(sensor, photons, origin=(3, 6)))
 
 
 @needs_engine
