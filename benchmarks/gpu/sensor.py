@@ -10,7 +10,8 @@ from job import Absent, Job, median_seconds
 from sizes import Sizes
 
 THREE_BITS = "3-bit codes"
-PACKED = "1-bit codes, packed"
+ONE_BIT = "1-bit codes"
+PACKED = f"{ONE_BIT}, packed"
 # s; expected photons per pixel of the 3-bit and the 1-bit sensor
 EXPOSURE = 5e-4
 PHOTONS = 3.25
@@ -65,11 +66,14 @@ def _on_device(where: str, sizes: Sizes) -> list[dict[str, Any]]:
 
     from qsim import Key
     from qsim.sensor.devices import quiver_physical
+    from qsim.sensor.spad import BinarySPAD
 
     try:
         import torch
 
-        from quiver.data.device_codes import codes_on_device
+        from qsim.sensor.row import Row
+        from quiver.data.device_codes import codes_of_rows, codes_on_device
+        from quiver.device import wait
     except ModuleNotFoundError as error:
         return [{"by": where, "what": f"{THREE_BITS}, on the device: not measured, {error.name} is not installed"}]
     sensor = quiver_physical(PHOTONS)
@@ -89,6 +93,14 @@ def _on_device(where: str, sizes: Sizes) -> list[dict[str, Any]]:
         seconds = median_seconds(lambda given=given: codes_on_device(sensor, given, EXPOSURE, key=key), sizes.rounds)
         what = f"{THREE_BITS}, from {start} to a torch tensor on {codes.device.type}"
         found.append(_row(where, what, light.size / seconds / 1e9, **{"differing per million": 1e6 * different}))
+    batch = photons.unsqueeze(1)  # each frame a window with a key of its own
+    for what, device in ((THREE_BITS, sensor), (ONE_BIT, BinarySPAD(0.5, 25.0))):
+        rows = [Row(device, EXPOSURE, key.at(t)) for t in range(len(batch))]
+        drawn = codes_of_rows(batch, rows)[:, 0].cpu().numpy()
+        wrong = float(np.mean(drawn != device.sample(light, EXPOSURE, key=key)))
+        seconds = median_seconds(lambda rows=rows: codes_of_rows(batch, rows), sizes.rounds, lambda: wait(place))
+        label = f"{what} of {len(rows)} windows in one launch, from device to a torch tensor on {codes.device.type}"
+        found.append(_row(where, label, light.size / seconds / 1e9, **{"differing per million": 1e6 * wrong}))
     return found
 
 
