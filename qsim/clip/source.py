@@ -40,6 +40,8 @@ class Source:
     seed: Count | None = None  # of warped pictures
     number: Count | None = None  # of the clip among warped pictures
     motion: NotNegative | None = None  # largest, px/frame
+    shake: NotNegative | None = None  # share of warped pictures under a shaking camera
+    patterns: NotNegative | None = None  # share of layers of warped pictures that repeat a small part
 
     def __post_init__(self) -> None:
         records.settle(self)

@@ -6,10 +6,11 @@
 
 They cost a thousandth of a rendered clip, and have no shading and no blur. Pictures become linear light
 and are shrunk to half of their size at least, which removes most of their noise. Every clip draws its largest motion
-from 0 to `motion` px/frame; its layers translate, sway, rotate and zoom up to that. A pixel is the mean of 3 x 3
-bilinear samples; flow follows from the motion in closed form. Clip n is a function of the pictures, `seed` and n. An
-existing clip is kept, so the same command resumes; one of other settings is refused. The folder holds one clip folder
-per number, and the licences.
+from 0 to `motion` px/frame; its layers translate, sway, rotate and zoom up to that. A share of the clips is seen by a
+camera that shakes or is struck; a share of the layers repeats a small part, as facades and grids do. A pixel is the
+mean of 3 x 3 bilinear samples; flow follows from the motion in closed form. Clip n is a function of the pictures,
+`seed` and n. An existing clip is kept, so the same command resumes; one of other settings is refused. The folder holds
+one clip folder per number, and the licences.
 """
 
 from __future__ import annotations
@@ -35,12 +36,19 @@ from qsim.settings import setting
 from qsim.streams.clip import Clip
 
 Motion = Annotated[float, Meta(ge=0.0, le=100.0)]  # px/frame
+Part = Annotated[float, Meta(ge=0.0, le=1.0)]  # of clips or layers
 
 FINE = 2  # texels of a layer per pixel, at zoom 1
 SAMPLES = 3  # per pixel along each side
 STILL = 0.15  # share of clips in which nothing moves
 FASTEST_GROWTH = 0.05  # of the zoom, per frame
 SMOOTH = 0.25  # share of bodies with a smooth tone instead of a picture
+SHAKE = 0.4  # of the largest motion, to which a camera shakes
+SLOWEST, FASTEST = 0.05, 1.2  # rad/frame, of the waves of a shaking hand
+STRUCK = 0.3  # share of shaking cameras that are struck
+RINGING = (0.25, 0.8)  # rad/frame, of a struck camera
+LEAST_REPEAT, MOST_REPEAT = 2, 24  # px, period of a pattern
+WINDOWS = 0.5  # share of patterns that are a pane in a wall instead of a part of a picture
 
 
 @dataclass(frozen=True)
@@ -67,17 +75,56 @@ class Path2D:
         return np.array([[c, -s, y], [s, c, x], [0, 0, 1]])
 
 
+@dataclass(frozen=True)
+class Wave2D:
+    """A swing of the camera about the origin of the picture, which may begin late and die away."""
+
+    size: tuple[float, float, float]  # px down, px right, rad
+    frequency: float  # rad/frame
+    phase: float = 0.0
+    start: float = -np.inf  # frames
+    decay: float = 0.0  # per frame, from `start` on
+
+    def shift(self, time: float) -> Array:
+        """Return the displacement [3] = (px down, px right, rad) at a time."""
+        if time < self.start:
+            return np.zeros(3)
+        late = time - self.start if self.decay else time
+        swing = np.exp(-self.decay * late) * np.sin(self.frequency * late + self.phase)
+        return np.array(self.size) * swing
+
+
+@dataclass(frozen=True)
+class Camera2D:
+    """A camera that shakes: all layers move alike."""
+
+    waves: tuple[Wave2D, ...] = ()
+
+    def matrix(self, time: float) -> Array:
+        """Return the map [3, 3] of homogeneous (y, x, 1) in the picture of a camera at rest to this one."""
+        y, x, turn = sum((wave.shift(time) for wave in self.waves), np.zeros(3))
+        c = np.cos(turn)
+        s = np.sin(turn)
+        return np.array([[c, -s, y], [s, c, x], [0, 0, 1]])
+
+
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A picture with its cover, both around the layer's origin, and its motion."""
+    """A picture with its cover, both around the layer's origin, its motion, and the camera that sees it."""
 
     light: Array  # [h, w], FINE texels per pixel
     cover: Array | None  # [h, w] in 0..1; None: everywhere
     path: Path2D
+    camera: Camera2D = Camera2D()
+
+    def matrix(self, time: float) -> Array:
+        """Return the map [3, 3] of homogeneous (y, x, 1) from layer to picture at a time."""
+        found: Array = self.camera.matrix(time) @ self.path.matrix(time)
+        return found
 
     def sampled(self, points: Array, time: float) -> tuple[Array, Array]:
         """Return light and cover at picture points (y, x) [2, n] at a time."""
-        inverse = np.linalg.inv(self.path.matrix(time))
+        inverse = np.linalg.inv(self.matrix(time))
         at = FINE * (inverse[:2, :2] @ points + inverse[:2, 2:])
         at += np.array([[n / 2 - 0.5] for n in self.light.shape])
         light = ndimage.map_coordinates(self.light, at, order=1, mode="mirror")
@@ -86,19 +133,38 @@ class Layer:
         return light, ndimage.map_coordinates(self.cover, at, order=1, mode="constant")
 
 
-def layers(pictures: Sequence[Array], size: tuple[int, int], motion: float, rng: np.random.Generator) -> list[Layer]:
+def layers(
+    pictures: Sequence[Array],
+    size: tuple[int, int],
+    motion: float,
+    rng: np.random.Generator,
+    *,
+    shake: float = 0.0,
+    patterns: float = 0.0,
+) -> list[Layer]:
     """Return a background and zero to four bodies before it.
 
-    `pictures` are linear light [h, w]; `size` is that of the clip [px], `motion` its largest speed [px/frame].
+    `pictures` are linear light [h, w]; `size` is that of the clip [px], `motion` its largest speed [px/frame]. The
+    camera shakes with the probability `shake`, and a layer is a pattern with the probability `patterns`.
     """
     largest = 0.0 if rng.random() < STILL else motion * rng.random()
     side = max(size)
-    found = [Layer(_cut(pictures, 2 * side, rng), None, _path(size, largest, side, rng))]
+    camera = Camera2D()
+    if rng.random() < shake:
+        camera = _shaking(SHAKE * motion * rng.random(), side, rng)
+        largest *= 0.5 * rng.random()  # by itself; shake comes on top
+
+    def light_of(across: int) -> Array:
+        if rng.random() < patterns:
+            return _pattern(pictures, across, rng)
+        return _cut(pictures, across, rng)
+
+    found = [Layer(light_of(2 * side), None, _path(size, largest, side, rng), camera)]
     for _ in range(int(rng.integers(0, 5))):
         across = int(side * rng.uniform(0.15, 0.7))
-        light = _tone(across, rng) if rng.random() < SMOOTH else _cut(pictures, across, rng)
+        light = _tone(across, rng) if rng.random() < SMOOTH else light_of(across)
         own = largest * rng.choice([0.0, 0.5, 1.0], p=[0.2, 0.3, 0.5])
-        found.append(Layer(light, _outline(light.shape, rng), _path(size, own, across / 2, rng)))
+        found.append(Layer(light, _outline(light.shape, rng), _path(size, own, across / 2, rng), camera))
     return found
 
 
@@ -116,7 +182,7 @@ def frame(parts: Sequence[Layer], size: tuple[int, int], time: float) -> tuple[A
     moved = points.copy()
     for i, layer in enumerate(parts):
         # From the picture back to the layer, and from there to where its point is one frame later.
-        step = layer.path.matrix(time + 1) @ np.linalg.inv(layer.path.matrix(time))
+        step = layer.matrix(time + 1) @ np.linalg.inv(layer.matrix(time))
         own = top == i
         moved[:, own] = step[:2, :2] @ points[:, own] + step[:2, 2:]
     inside = (moved >= 0).all(0) & (moved[0] <= height - 1) & (moved[1] <= width - 1)
@@ -155,6 +221,45 @@ def _path(size: tuple[int, int], largest: float, radius: float, rng: np.random.G
         spin=float(shares[2] / radius * rng.choice([-1, 1])),
         growth=float(min(shares[3] / radius, FASTEST_GROWTH) * rng.choice([-1, 1])),
     )
+
+
+def _shaking(largest: float, side: float, rng: np.random.Generator) -> Camera2D:
+    """Return a camera that moves points up to `side` px from the origin by at most about `largest` px/frame."""
+    if rng.random() < STRUCK:
+        axis = rng.normal(0, (1.0, 1.0, 0.3 / side))
+        frequency = rng.uniform(*RINGING)
+        size = axis / np.hypot(*axis[:2]) * largest / frequency
+        decay = rng.uniform(0.03, 0.2)
+        return Camera2D((Wave2D(_three(size), float(frequency), 0.0, float(rng.uniform(-8, 4)), float(decay)),))
+    # Slow waves are large and fast ones small: each has its share of the speed.
+    shares = rng.dirichlet((1.0,) * 6) * largest
+    waves = []
+    for share in shares:
+        angle = rng.uniform(0, 2 * np.pi)
+        frequency = np.exp(rng.uniform(np.log(SLOWEST), np.log(FASTEST)))
+        turn = rng.normal(0, 0.3) / side
+        size = np.array([np.sin(angle), np.cos(angle), turn]) * share / frequency
+        waves.append(Wave2D(_three(size), float(frequency), float(rng.uniform(0, 2 * np.pi))))
+    return Camera2D(tuple(waves))
+
+
+def _three(values: Array) -> tuple[float, float, float]:
+    y, x, turn = (float(value) for value in values)
+    return y, x, turn
+
+
+def _pattern(pictures: Sequence[Array], across: int, rng: np.random.Generator) -> Array:
+    """Return a square of `across` px in which a small part repeats: a part of a picture, or a pane in a wall."""
+    rows, columns = (round(FINE * np.exp(rng.uniform(np.log(LEAST_REPEAT), np.log(MOST_REPEAT)))) for _ in range(2))
+    if rng.random() < WINDOWS:
+        wall, pane = np.exp(rng.uniform(np.log(0.02), np.log(0.9), 2))
+        part = np.full((rows, columns), wall)
+        part[: max(1, int(rows * rng.uniform(0.3, 1.0))), : max(1, int(columns * rng.uniform(0.3, 1.0)))] = pane
+    else:
+        part = _cut(pictures, max(rows, columns), rng)[:rows, :columns]
+    side = FINE * across
+    repeats = [-(-side // n) for n in part.shape]
+    return np.tile(part, repeats)[:side, :side]
 
 
 def _cut(pictures: Sequence[Array], across: int, rng: np.random.Generator) -> Array:
@@ -244,6 +349,8 @@ class WarpedPictures:
     height: Annotated[Frames, setting("pixels")] = 112
     width: Annotated[Frames, setting("pixels")] = 112
     motion: Annotated[Motion, setting("largest motion, px/frame")] = 16.0
+    shake: Annotated[Part, setting("share of clips under a shaking camera")] = 0.4
+    patterns: Annotated[Part, setting("share of layers that repeat a small part")] = 0.2
     split: Annotated[Split, setting("stored in the clips")] = "train"
     seed: Annotated[Seed, setting("of everything random")] = 0
 
@@ -276,7 +383,8 @@ def make(asked: WarpedPictures) -> int:
     _copy_licence(licence, folder)
     for n, path in missing.items():
         rng = np.random.default_rng([asked.seed, n])
-        write_clip(path, layers(lights, size, asked.motion, rng), size, _described(n, digests, asked))
+        parts = layers(lights, size, asked.motion, rng, shake=asked.shake, patterns=asked.patterns)
+        write_clip(path, parts, size, _described(n, digests, asked))
     return len(missing)
 
 
@@ -288,14 +396,21 @@ def _described(n: int, digests: list[str], asked: WarpedPictures) -> ClipInfo:
         exposure=1 / 2000.0,
         split=asked.split,
         assets=tuple(digests),
-        source=Source(format="warped pictures", seed=asked.seed, number=n, motion=asked.motion),
+        source=Source(
+            format="warped pictures",
+            seed=asked.seed,
+            number=n,
+            motion=asked.motion,
+            shake=asked.shake,
+            patterns=asked.patterns,
+        ),
     )
 
 
 def _check_same(path: Path, wanted: ClipInfo) -> None:
     """Raise `ValueError` if a clip has another size, other pictures, another seed or motion; its split may differ."""
     there = Clip.open(path).info
-    for key, what in (("shape", "size"), ("assets", "set of pictures"), ("source", "seed or motion")):
+    for key, what in (("shape", "size"), ("assets", "set of pictures"), ("source", "seed, motion, shake or patterns")):
         if getattr(there, key) != getattr(wanted, key):
             raise ValueError(f"{path}: was made with another {what}; name another folder, or another first=")
 

@@ -11,7 +11,16 @@ from scipy import ndimage
 
 from qsim import files
 from qsim.cli import warped_pictures
-from qsim.formats.warped_pictures import Layer, Path2D, frame, layers
+from qsim.formats.warped_pictures import (
+    FINE,
+    LEAST_REPEAT,
+    MOST_REPEAT,
+    SHAKE,
+    Layer,
+    Path2D,
+    frame,
+    layers,
+)
 from qsim.streams.clip import Clip
 from quiver.data.clips import open_clips
 
@@ -41,7 +50,7 @@ def test_flow_leads_to_the_same_light():
     soft = [ndimage.gaussian_filter(rng.random((300, 300)), 8, mode="wrap") * 3 for _ in range(2)]
     inside = 0
     for _ in range(8):
-        parts = layers(soft, (60, 70), 8.0, rng)
+        parts = layers(soft, (60, 70), 8.0, rng, shake=0.5)
         time = float(rng.uniform(-4, 4))
         now, flow, valid = frame(parts, (60, 70), time)
         later = frame(parts, (60, 70), time + 1)[0]
@@ -52,6 +61,39 @@ def test_flow_leads_to_the_same_light():
         assert np.percentile(off, 75) < 0.05 * now.mean()
         inside += int(valid.sum())
     assert inside > 8 * 60 * 70 / 3
+
+
+def test_a_shaking_camera_keeps_its_speed_and_changes_direction():
+    """Two hundred cameras at 16 px/frame, layers at rest: no point moves twice as far as shake may, and no path with
+    one velocity and one acceleration follows most of them.
+    """
+    rng = np.random.default_rng(4)
+    flat = [np.ones((64, 64))]
+    times = np.arange(-5.0, 6.0)
+    path = np.stack([np.ones_like(times), times, times**2], axis=1)
+    left = []
+    for _ in range(200):
+        camera = layers(flat, (30, 30), 16.0, rng, shake=1.0)[0].camera
+        corners = np.array([[0, 0, 1], [0, 30, 1], [30, 0, 1], [30, 30, 1]]).T
+        places = np.stack([(camera.matrix(t) @ corners)[:2].ravel() for t in times])
+        assert np.abs(np.diff(places, axis=0)).max() < 2 * SHAKE * 16
+        rest = places - path @ np.linalg.lstsq(path, places, rcond=None)[0]
+        left.append(float(np.abs(rest).max()))
+    assert np.median(left) > 0.5
+
+
+def test_patterns_repeat():
+    """A background that is all pattern: some shift of at most MOST_REPEAT px along each axis gives the same light."""
+    rng = np.random.default_rng(5)
+    soft = [rng.random((300, 300))]
+    for _ in range(20):
+        light = layers(soft, (30, 30), 0.0, rng, patterns=1.0)[0].light
+        for axis in (0, 1):
+            lines = np.moveaxis(light, axis, 0)
+            assert any(
+                np.array_equal(lines[n:], lines[:-n]) for n in range(FINE * LEAST_REPEAT - 1, FINE * MOST_REPEAT + 1)
+            )
+        assert np.ptp(light) > 0
 
 
 def test_a_layer_that_slides_moves_by_its_speed():
@@ -94,8 +136,10 @@ def test_a_repeat_gives_the_same_bytes_and_keeps_what_is_there(pictures, tmp_pat
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["--seed", 1], "seed or motion"),
-        (["--motion", 4], "seed or motion"),
+        (["--seed", 1], "seed, motion, shake or patterns"),
+        (["--motion", 4], "seed, motion, shake or patterns"),
+        (["--shake", 0], "seed, motion, shake or patterns"),
+        (["--patterns", 1], "seed, motion, shake or patterns"),
         (["--frames", 6], "size"),
         ([], "set of pictures"),
     ],
