@@ -67,9 +67,10 @@ def generate(
     *,
     make: RenderJob = render_job,
     run: Executor | None = None,
+    order: Callable[[Jobs], Iterable[Job]] = iter,
     on_result: Callable[[Result], None] | None = None,
 ) -> Summary:
-    """Make the missing clips of a recipe's data set in folder `path`.
+    """Make the missing clips of a recipe's data set in folder `path`, in the order in which `order` gives its jobs.
 
     `run` executes the jobs (default: local processes; dask_cluster.py has another executor), `make` renders one clip.
     `ValueError` if the folder belongs to another recipe or another generator uses it, `OSError` if the disk is full.
@@ -81,7 +82,7 @@ def generate(
         with _locked(folder, options):
             repaired = _begin(recipe, folder, jobs, options.repair)
             repaired += repair_jobs(folder, jobs) if options.repair else ()
-            todo = _Todo(folder, jobs, retry=options.retry)
+            todo = _Todo(folder, order(jobs), retry=options.retry)
             with contextlib.closing((run or _runner(options))(todo, folder, make)) as results:
                 for result in results:
                     if result.state == "full":
@@ -108,9 +109,8 @@ class _Todo:
     deleted, and it has failed.
     """
 
-    def __init__(self, folder: Path, jobs: Jobs, *, retry: bool) -> None:
+    def __init__(self, folder: Path, jobs: Iterable[Job], *, retry: bool) -> None:
         self.folder = folder
-        self.jobs = jobs
         self.before = 0  # finished before
         self.made = 0
         self.failed: dict[str, str] = {}

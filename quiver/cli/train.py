@@ -6,8 +6,8 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,6 +27,7 @@ from quiver.restoration.interface import RestoreOptions
 from quiver.training.settings import PROTOCOLS, Settings
 
 if TYPE_CHECKING:
+    from quiver.training.rendering import Rendering
     from quiver.training.schedule import State
 
 DIVERGED = 3  # exit code of a run whose loss became NaN or infinite
@@ -53,6 +54,48 @@ class Train:
 )
 def train(asked: Train, given: Annotated[dict[str, Any], Settings]) -> int:
     """Train, or resume a run; return 3 if it diverges."""
+    if asked.force:
+        running().after_interrupt = WITHOUT_FORCE
+    interrupted: list[int] = []
+    with ExitStack() as stack:
+        stack.enter_context(_signals(interrupted))
+        rendering = _rendering(given, lambda: bool(interrupted))
+        if rendering is not None:
+            given = given | {"data": str(rendering.folder)}
+            stack.enter_context(rendering)
+            note(f"{rendering.source}: is rendered into {rendering.folder} while the network learns")
+            rendering.wait()
+        return _trained(asked, given, rendering, interrupted)
+
+
+def _rendering(given: Mapping[str, Any], should_stop: Callable[[], bool]) -> Rendering | None:
+    """Return the data set to render meanwhile, if the data is a recipe; `ValueError` where that cannot be."""
+    from quiver.training.rendering import Rendering, folder_of, is_recipe
+
+    data = given["data"]
+    sources = (data,) if isinstance(data, str) else data
+    recipes = [source for source in sources if is_recipe(source)]
+    if not recipes:
+        return None
+    source = recipes[0]
+    if len(sources) > 1:
+        raise ValueError(f"{source}: what is rendered meanwhile is the only data of a run; give the recipe alone")
+    if str(given.get("network", Settings.network)).startswith("bit2bit"):
+        raise ValueError(f"{source}: bit2bit learns from one stored stream; give a stream")
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise ValueError(
+            f"{source}: one process trains while it renders; render first with `qsim generate`, or leave torchrun out"
+        )
+    run = Path(given["out"])
+    folder = folder_of(source, run)
+    if folder.resolve() == run.resolve():
+        raise ValueError(f"{run}: the data set of {source} is rendered into this folder; choose another for the run")
+    validation = given.get("validation_split", Settings.validation_split)
+    return Rendering(source, folder, validation, should_stop=should_stop, note=note)
+
+
+def _trained(asked: Train, given: dict[str, Any], rendering: Rendering | None, interrupted: list[int]) -> int:
+    """Train, or resume a run; return 3 if it diverges."""
     import torch
 
     from quiver import threads
@@ -63,9 +106,6 @@ def train(asked: Train, given: Annotated[dict[str, Any], Settings]) -> int:
     from quiver.training import loop
     from quiver.training.loop import Diverged
     from quiver.training.run_folder import draw_curve
-
-    if asked.force:
-        running().after_interrupt = WITHOUT_FORCE
 
     first = weights_path(given["start"]) if "start" in given else None
     settings = settings_of_run(asked.protocol, given | ({} if first is None else {"start": digest(first)}))
@@ -92,18 +132,17 @@ def train(asked: Train, given: Annotated[dict[str, Any], Settings]) -> int:
     earlier = None if asked.force else threads.recorded(folder / "settings.json")
     settings = replace(settings, threads=use_threads(settings.threads, earlier))
     torch.manual_seed(settings.seed)
-    interrupted: list[int] = []
     try:
-        with _signals(interrupted):
-            state = loop.train(
-                network_of(settings, first),
-                settings,
-                device=pick_device(asked.device),
-                should_stop=lambda: bool(interrupted),
-                progress=not running().silent,
-                force=asked.force,
-                note=note,
-            )
+        state = loop.train(
+            network_of(settings, first),
+            settings,
+            device=pick_device(asked.device),
+            should_stop=lambda: bool(interrupted),
+            progress=not running().silent,
+            force=asked.force,
+            note=note,
+            rendering=rendering,
+        )
     except Diverged as error:
         text = f"{error.problem}; lower the learning rate and start again with --force"
         return failed(f"quiver: {text}", DIVERGED, running().printing.json and leads)

@@ -163,7 +163,7 @@ class Windows(Dataset[dict[str, Any]]):
             return self._middle(n % self.length)
         settings = self.settings
         epoch, index = divmod(n, self.length)
-        clip = shuffled(self.length, (settings.seed, epoch), index) % len(self.clips)
+        clip = self.clip_of(n)
         rng = np.random.default_rng((settings.seed, epoch, index))
         length, height, width = self.clip(clip).shape
         frame = int(rng.integers(length - settings.frames + 1))
@@ -192,6 +192,11 @@ class Windows(Dataset[dict[str, Any]]):
             backwards=backwards and timing.rows is None,
             key=Key(seed=settings.seed, clip=n, stage=TRAINING),
         )
+
+    def clip_of(self, n: int) -> int:
+        """Return the number of the clip that sample n draws."""
+        epoch, index = divmod(n, self.length)
+        return shuffled(self.length, (self.settings.seed, epoch), index) % len(self.clips)
 
     def _drift(self, clip: int, rng: np.random.Generator) -> tuple[int, int]:
         """Return the drift of the crop [px/frame], limited by the size of the clip."""

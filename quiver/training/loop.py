@@ -32,6 +32,7 @@ from qsim.keys import Key
 from qsim.terminal import Tolerant
 from quiver import threads
 from quiver.data.clips import clips_digest, split_clips, unfinished
+from quiver.data.growing import GrowingWindows
 from quiver.data.illumination import OTHERS
 from quiver.data.stream_windows import StreamWindows
 from quiver.data.windows import Batches, Windows, WindowSettings
@@ -44,7 +45,8 @@ from quiver.training.ahead import Copy, Pending
 from quiver.training.compiling import Compiled, why_not
 from quiver.training.optimiser import Optimiser
 from quiver.training.processes import Process, begin_worker, joined, plain_errors
-from quiver.training.run_folder import Run
+from quiver.training.rendering import Rendering
+from quiver.training.run_folder import SCHEDULE, Run
 from quiver.training.saving import CHECKPOINT_SECONDS, first_line
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
 from quiver.training.self_supervised import make_stream_windows
@@ -68,12 +70,17 @@ class Diverged(RuntimeError):
 
 
 def make_windows(
-    settings: Settings, multiple: int, system: System = OURS, frames: int | None = None, least: int = 1
+    settings: Settings,
+    multiple: int,
+    system: System = OURS,
+    frames: int | None = None,
+    least: int = 1,
+    rendering: Rendering | None = None,
 ) -> tuple[Windows, Subset[dict[str, Any]]]:
     """Return training and fixed validation windows; without validation clips the training clips, with a warning.
 
     Sides of validation windows are multiples of `multiple`; they have `frames` frames, by default those of the system.
-    `least` frames is the shortest window of the network.
+    `least` frames is the shortest window of the network. While the clips are rendered, windows grow with them.
     """
     window = WindowSettings(
         lights=settings.noise,
@@ -87,8 +94,14 @@ def make_windows(
         seed=settings.seed,
         least=least,
     )
-    training, validation = split_clips(settings.data, settings.validation_split)
-    windows = Windows(training, window, prepare=system.prepare)
+    windows: Windows
+    if rendering is None:
+        training, validation = split_clips(settings.data, settings.validation_split)
+        windows = Windows(training, window, prepare=system.prepare)
+    else:
+        training, validation = rendering.clips()
+        schedule = rendering.schedule(Path(settings.out) / SCHEDULE)
+        windows = GrowingWindows(training, window, schedule, prepare=system.prepare)
     for noise in windows.noise.noises:
         if noise.sensing.exposures is not None:
             raise ValueError(f"{noise.sensor}: networks do not know exposures that take turns; {OTHERS}")
@@ -103,11 +116,30 @@ def make_windows(
     return windows, Subset(fixed, fixed.spread(settings.validation_windows))
 
 
-def batches(windows: AnyWindows, settings: Settings, state: State, process: Process) -> Iterator[dict[str, Any]]:
+class NumbersWhileRendering(Batches):
+    """Sample numbers of batch after batch; clips that are finished when a batch is given out may be drawn by it."""
+
+    def __init__(self, numbers: Batches, rendering: Rendering, windows: GrowingWindows) -> None:
+        super().__init__(numbers.batch, numbers.first, numbers.last)
+        self.rendering = rendering
+        self.schedule = windows.schedule
+
+    def __iter__(self) -> Iterator[list[int]]:
+        for numbers in super().__iter__():
+            self.rendering.look(self.schedule, numbers[0])
+            yield numbers
+
+
+def batches(
+    windows: AnyWindows, settings: Settings, state: State, process: Process, rendering: Rendering | None = None
+) -> Iterator[dict[str, Any]]:
     """Yield the batches from the current step on; workers draw the same bytes as this process."""
     last = state.step if state.finished else settings.steps or FOREVER
     numbers = Batches(settings.batch, state.step, last, process.rank, process.world)
     workers = drawing_processes(settings.workers, process)
+    if rendering is not None:
+        assert isinstance(windows, GrowingWindows)
+        numbers = NumbersWhileRendering(numbers, rendering, windows)
     loader = DataLoader(
         windows,
         batch_sampler=numbers,
@@ -253,6 +285,7 @@ class Trainer:
         self.copies: list[Copy] = []  # whose memory is free
         self.low = precision_of(settings, process.device) == "bfloat16"
         self.board: Board | None = None
+        self.rendering: Rendering | None = None  # of the clips to validate on
         self.started = time.monotonic() - self.state.elapsed
         self.saved = time.monotonic()
         self.loss = math.nan  # of the last step that was read
@@ -371,6 +404,8 @@ class Trainer:
         if not self.process.any(validation_due(settings, state)) and not state.finished:
             return
         self.settle()  # nothing is stored of a step that was not read
+        if self.rendering is not None:
+            self.rendering.complete()
         began = time.monotonic()
         if self.fixed is None:  # nothing to validate on: the last weights count as the best
             if self.board is not None and state.finished:
@@ -431,12 +466,14 @@ def train(
     progress: bool = True,
     force: bool = False,
     note: Callable[[str], None] = lambda line: None,
+    rendering: Rendering | None = None,
 ) -> State:
     """Train `model` in place to the end that the settings define, or until `should_stop`; return its state.
 
     On clips of three bands it becomes the core of a `MosaicNet`, which is what the run stores.
     A run in `settings.out` is resumed; `force` starts it again from the beginning. `note` receives lines about the
-    noise of the windows, missing clips, and the step from which the run goes. ValueError and OSError for settings and
+    noise of the windows, missing clips, and the step from which the run goes. `rendering` makes the clips meanwhile;
+    its first ones are there. ValueError and OSError for settings and
     folders that do not fit, `Diverged` for NaN or Inf. During the call torch has the number of threads that the
     settings ask for, and denormal numbers are zero in this thread.
     """
@@ -461,11 +498,15 @@ def train(
             system = system_of(model).on(process.device)
             system.refuse(model, settings)
             validated = system.validated(model, settings)
-            windows, fixed = make_windows(settings, system.side(model), system, validated, system.window(model))
-            lines += unfinished(settings.folders)
-        conditions = {"processes": process.world, "computes_in": precision_of(settings, process.device)}
+            windows, fixed = make_windows(
+                settings, system.side(model), system, validated, system.window(model), rendering
+            )
+            lines += [] if rendering is not None else unfinished(settings.folders)
+        conditions: dict[str, Any] = {"processes": process.world, "computes_in": precision_of(settings, process.device)}
         begun = not force and (Path(settings.out) / "settings.json").is_file()
-        run = Run(settings, conditions | {"clips": source_digest(windows, fixed), "validated_frames": validated})
+        conditions["rendered"] = "before" if rendering is None else "meanwhile"
+        conditions |= {"clips": source_digest(windows, fixed), "validated_frames": validated}
+        run = Run(settings, conditions)
         # Made once for its errors: settings that do not fit must not cost the run that `force` removes.
         Optimiser(model.to(process.device), settings.optimiser, settings.learning_rate, settings.betas)
         if process.leads:
@@ -480,7 +521,8 @@ def train(
             note(first_line(state.step, steps=settings.steps, begun=begun, finished=state.finished))
             trainer.board = Board(run.folder, settings, trainer.state, progress)
             stack.callback(trainer.board.close)
-        for batch in batches(windows, settings, trainer.state, process):
+        trainer.rendering = rendering
+        for batch in batches(windows, settings, trainer.state, process, rendering):
             trainer.step(batch)
             interrupted = process.any(should_stop())
             trainer.validate_if_due()

@@ -32,13 +32,15 @@ from quiver.training.schedule import State
 from quiver.training.settings import Settings, portable, short
 
 OURS = (  # files that a run writes
-    r"(settings|history)\.json|(checkpoint|failed(-\d+)?)\.pt|(best|last)\.safetensors|curve\.png|lock|"
+    r"(settings|history|schedule)\.json|(checkpoint|failed(-\d+)?)\.pt|(best|last)\.safetensors|curve\.png|lock|"
     r"events\.out\.tfevents\..*"
 )
+SCHEDULE = "schedule.json"  # of a run whose clips are rendered meanwhile
 LOCK = "lock"  # held by the process that works in the folder
 CONDITIONS = {  # of a run, beside its settings: what a folder holds if one of them differs
     "processes": "holds a run whose number of processes is {}, now it is {}",
     "computes_in": "holds a run that computes in {}, now it would compute in {}",
+    "rendered": "holds a run on clips that were rendered {}, now they are {}",
     "clips": "holds a run on other clips or codes than are there now",
     "validated_frames": "holds a run that was validated on windows of {} frames, now it is {}",
 }

@@ -52,7 +52,7 @@ class Settings:
     data: Annotated[
         str | tuple[Text, ...],
         setting(
-            "data set folders; for bit2bit a stored stream, or a clip with one",
+            "data set folders, or a recipe to render meanwhile; for bit2bit a stored stream",
             positional=True,
         ),
     ]
