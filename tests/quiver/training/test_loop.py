@@ -25,6 +25,7 @@ from runs import same_weights, settings, small_network, tiny, tiny_settings
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from quiver import threads
 from quiver.evaluation import metrics
 from quiver.evaluation.macs import macs
 from quiver.model.blocks import RADIUS, Output
@@ -151,9 +152,10 @@ def test_a_run_is_replaced_only_by_one_that_can_start(tiny_dataset, tmp_path, mo
 
 
 @pytest.mark.slow
-def test_a_run_leaves_its_process_as_it_was(tiny_dataset, tmp_path):
-    """Threads of torch and denormal numbers, whether it ends or fails."""
+def test_a_run_leaves_its_process_as_it_was(tiny_dataset, tmp_path, monkeypatch):
+    """Threads of torch and denormal numbers, whether it ends or fails; on a machine of one core, too."""
     before = torch.get_num_threads()
+    monkeypatch.setattr(threads, "cores", lambda: before + 1)
     train(small_network(), settings(tiny_dataset, tmp_path / "r", steps=1, threads=before + 1), progress=False)
     with pytest.raises(ValueError, match="crop"):
         train(small_network(), settings(tiny_dataset, tmp_path / "s", crop=18), progress=False)
