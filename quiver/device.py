@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 DEVICES = ("auto", "cpu", "cuda")
 HOST_MEMORY = 2_000_000_000  # bytes; working memory where none is stated and no GPU runs
+LIGHT_SHARE = 0.4  # of a GPU's memory, for the light of the clips that train there
 AHEAD = 2  # training steps that a host may be ahead of its GPU: enough to keep it busy
 
 
@@ -37,6 +38,13 @@ def default_memory(kind: str) -> int:
     import torch
 
     return int(torch.cuda.mem_get_info()[1]) // 2 if kind == "cuda" else HOST_MEMORY
+
+
+def light_memory(device: torch.device) -> int:
+    """Return the memory [bytes] for the light of training clips: LIGHT_SHARE of a GPU's, else HOST_MEMORY."""
+    import torch
+
+    return int(LIGHT_SHARE * torch.cuda.mem_get_info(device)[1]) if is_gpu(device) else HOST_MEMORY
 
 
 def device_of_process(kind: str) -> torch.device:

@@ -60,6 +60,7 @@ TRAINING = 1
 VALIDATION = 2
 STILL = 3
 SHUFFLED = 1 << 16  # numbers of an epoch that are shuffled together
+DARKEST = 1e-9  # photons, least mean of a window that is brought to a light level
 KEPT = 256  # clips that stay open, with what draws their codes
 # Turns that keep the direction in which rows (0) or columns (1) are read: none, and mirrored along them
 TURNS_OF_ROWS = ((0, 4), (0, 6))
@@ -278,7 +279,7 @@ class Windows(Dataset[dict[str, Any]]):
         scale = 1.0
         if settings.force_exposure and noise.ppp is not None:
             # As published: every window is exposed to the light level by its own mean, not by that of its clip.
-            scale = noise.ppp / max(float((photons if self.filters is None else sharp).mean()), 1e-9)
+            scale = noise.ppp / max(float((photons if self.filters is None else sharp).mean()), DARKEST)
         try:
             if noise.defects is None and draw.timing == Timing():  # any pixel of the sensor, in its own random numbers
                 codes = draw_codes(draw.sensor, photons * scale, exposure, place.key)
@@ -297,8 +298,7 @@ class Windows(Dataset[dict[str, Any]]):
             "peak": peak,
             "ppp": float((photons * scale).mean()),
             "sample": n,
-            "key": f"{clip.name} frame {place.start}, (y, x) ({place.y}, {place.x}), turn {place.turn}, "
-            f"{'backwards, ' if place.backwards else ''}{noise.label}, {place.key}",
+            "key": self.text_of(place),
         }
         shares = None
         if draw.timing.shares is not None:
@@ -312,6 +312,13 @@ class Windows(Dataset[dict[str, Any]]):
             return sample
         seen = array_codes(codes, behind, exposure, name=clip.name)
         return sample | dict(self.prepare(replace(seen, ppp=level, shares=shares, colour=self.filters)))
+
+    def text_of(self, place: WindowPlace) -> str:
+        """Return the text `key` of a window."""
+        return (
+            f"{self.clip(place.clip).name} frame {place.start}, (y, x) ({place.y}, {place.x}), turn {place.turn}, "
+            f"{'backwards, ' if place.backwards else ''}{self.noise.noises[place.light].label}, {place.key}"
+        )
 
     def photons_of(self, place: WindowPlace) -> tuple[Array, Array]:
         """Return the expected photons of the exposed and of the sharp window, float64 [T, h, w] each, turned.

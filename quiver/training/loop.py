@@ -32,11 +32,12 @@ from qsim.keys import Key
 from qsim.terminal import Tolerant
 from quiver import threads
 from quiver.data.clips import clips_digest, split_clips, unfinished
+from quiver.data.device_windows import DeviceWindows, Unfit
 from quiver.data.growing import GrowingWindows
 from quiver.data.illumination import OTHERS
 from quiver.data.stream_windows import StreamWindows
 from quiver.data.windows import Batches, Windows, WindowSettings
-from quiver.device import Reading, is_gpu, moved, steps_ahead
+from quiver.device import Reading, is_gpu, light_memory, moved, steps_ahead
 from quiver.evaluation import metrics
 from quiver.host import flushed_denormals
 from quiver.model.mosaic_network import MosaicNet
@@ -58,6 +59,7 @@ AnyWindows = Windows | StreamWindows
 FOREVER = 10**9  # steps of a run that only time limits
 PREFETCHED = 4  # batches that each worker draws in advance
 MOST_WORKERS = 16  # that are started for a GPU if their number is not stated
+PLACING = 2  # the same where the GPU draws, and workers state places alone: 0.2 ms for each window
 VALIDATION_SIDE = 128  # px, of the validation windows at most
 
 
@@ -130,18 +132,44 @@ class NumbersWhileRendering(Batches):
             yield numbers
 
 
+def on_its_device(windows: AnyWindows, settings: Settings, process: Process) -> tuple[DeviceWindows | None, list[str]]:
+    """Return what draws the windows on the device of this process, None where the host does; and a line about it.
+
+    `ValueError` where the device is asked for and cannot.
+    """
+    wanted = settings.windows == "device" or (settings.windows == "auto" and is_gpu(process.device))
+    if not wanted:
+        return None, []
+    try:
+        if isinstance(windows, StreamWindows):
+            raise Unfit("they are crops of a stream")
+        if isinstance(windows, GrowingWindows):
+            raise Unfit("their clips are rendered meanwhile")
+        found = DeviceWindows(windows, process.device, light_memory(process.device))
+    except Unfit as error:
+        if settings.windows == "device":
+            raise ValueError(f"windows=device: no device draws these windows: {error}; leave it out") from None
+        return None, [f"windows are drawn on the host: {error}"]
+    return found, [f"windows are drawn on the device, which holds {2 * found.light.numel() / 1e9:.3g} GB of light"]
+
+
 def batches(
-    windows: AnyWindows, settings: Settings, state: State, process: Process, rendering: Rendering | None = None
+    windows: AnyWindows,
+    settings: Settings,
+    state: State,
+    process: Process,
+    rendering: Rendering | None = None,
+    device: DeviceWindows | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Yield the batches from the current step on; workers draw the same bytes as this process."""
+    """Yield the batches from the current step on; workers, or a device, draw the same ones as this process."""
     last = state.step if state.finished else settings.steps or FOREVER
     numbers = Batches(settings.batch, state.step, last, process.rank, process.world)
-    workers = drawing_processes(settings.workers, process)
+    workers = drawing_processes(settings.workers, process, most=MOST_WORKERS if device is None else PLACING)
     if rendering is not None:
         assert isinstance(windows, GrowingWindows)
         numbers = NumbersWhileRendering(numbers, rendering, windows)
-    loader = DataLoader(
-        windows,
+    loader: DataLoader[Any] = DataLoader(
+        windows if device is None else device.places,
         batch_sampler=numbers,
         num_workers=workers,
         multiprocessing_context="spawn" if workers else None,
@@ -152,10 +180,10 @@ def batches(
         pin_memory=is_gpu(process.device),
     )
     with plain_errors():
-        yield from loader
+        yield from loader if device is None else map(device.draw, loader)
 
 
-def drawing_processes(asked: int | None, process: Process) -> int:
+def drawing_processes(asked: int | None, process: Process, most: int) -> int:
     """Return how many processes draw samples: as asked, else none beside a CPU that trains, and most cores for a GPU.
 
     Each of the processes of a machine that train keeps a core.
@@ -165,7 +193,7 @@ def drawing_processes(asked: int | None, process: Process) -> int:
     if not is_gpu(process.device):
         return 0
     here = int(os.environ.get("LOCAL_WORLD_SIZE", process.world))
-    return max(1, min(MOST_WORKERS, threads.cores() // here - 1))
+    return max(1, min(most, threads.cores() // here - 1))
 
 
 def parts_of(batch: Batch, count: int) -> Iterator[Batch]:
@@ -503,6 +531,8 @@ def train(
             )
             lines += [] if rendering is not None else unfinished(settings.folders)
         conditions: dict[str, Any] = {"processes": process.world, "computes_in": precision_of(settings, process.device)}
+        held, about = on_its_device(windows, settings, process)
+        lines += about
         begun = not force and (Path(settings.out) / "settings.json").is_file()
         conditions["rendered"] = "before" if rendering is None else "meanwhile"
         conditions |= {"clips": source_digest(windows, fixed), "validated_frames": validated}
@@ -522,7 +552,7 @@ def train(
             trainer.board = Board(run.folder, settings, trainer.state, progress)
             stack.callback(trainer.board.close)
         trainer.rendering = rendering
-        for batch in batches(windows, settings, trainer.state, process, rendering):
+        for batch in batches(windows, settings, trainer.state, process, rendering, held):
             trainer.step(batch)
             interrupted = process.any(should_stop())
             trainer.validate_if_due()

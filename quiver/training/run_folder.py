@@ -133,7 +133,7 @@ class Run:
     def _check_settings(self) -> None:
         wanted = self.settings.to_dict()
         found = read_json(self.folder / "settings.json")
-        free = {"out", "workers", "threads"}
+        free = {"out", "workers", "windows", "threads"}
         defaults = {each.name: each.default for each in fields(Settings)}  # of settings that an older run lacks
         for name in wanted:
             if name not in free and _alone(found.get(name, defaults[name])) != _alone(wanted[name]):

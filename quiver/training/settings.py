@@ -134,6 +134,10 @@ class Settings:
     workers: Annotated[
         Count | None, setting("processes that draw samples", unset="0: this one; for a GPU most cores")
     ] = None
+    windows: Annotated[
+        Literal["auto", "host", "device"],
+        setting("where windows are drawn", unset="auto: on a GPU if it can and holds the clips"),
+    ] = "auto"  # the same windows, see device_windows.py
     scan: Wanted = None
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"],

@@ -477,14 +477,51 @@ def test_the_number_of_workers_follows_the_device(monkeypatch):
     """None beside a CPU that trains; for a GPU most cores, shared by the processes of a machine."""
     monkeypatch.setattr(training.threads, "cores", lambda: 12)
     alone = Process(0, 1, torch.device("cpu"))
-    assert [training.drawing_processes(asked, alone) for asked in (None, 0, 5)] == [0, 0, 5]
+    assert [training.drawing_processes(asked, alone, 16) for asked in (None, 0, 5)] == [0, 0, 5]
     monkeypatch.setattr(training, "is_gpu", lambda device: True)
-    assert [training.drawing_processes(asked, alone) for asked in (None, 0, 5)] == [11, 0, 5]
-    assert training.drawing_processes(None, Process(1, 4, torch.device("cpu"))) == 2
+    assert [training.drawing_processes(asked, alone, 16) for asked in (None, 0, 5)] == [11, 0, 5]
+    assert training.drawing_processes(None, alone, 2) == 2
+    assert training.drawing_processes(None, Process(1, 4, torch.device("cpu")), 16) == 2
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")  # of eight processes on four machines
-    assert training.drawing_processes(None, Process(1, 8, torch.device("cpu"))) == 5
+    assert training.drawing_processes(None, Process(1, 8, torch.device("cpu")), 16) == 5
     monkeypatch.setattr(training.threads, "cores", lambda: 1)
-    assert training.drawing_processes(None, alone) == 1
+    assert training.drawing_processes(None, alone, 16) == 1
+
+
+def test_windows_drawn_on_a_device_train_the_same_weights(tiny_dataset, tmp_path):
+    """Also resumed, by another number of workers and from the other place."""
+    networks = {}
+    for place in ("host", "device"):
+        networks[place] = small_network()
+        asked = settings(tiny_dataset, tmp_path / place, steps=4, windows=place, drift=2)
+        said = list[str]()
+        train(networks[place], asked, progress=False, note=said.append)
+        assert bool([line for line in said if "which holds 0.000133 GB of light" in line]) == (place == "device")
+    assert same_weights(networks["host"], networks["device"])
+    resumed = small_network()
+    stops = iter((False, True))
+    once = settings(tiny_dataset, tmp_path / "r", steps=4, windows="device", drift=2)
+    train(resumed, once, should_stop=lambda: next(stops), progress=False)
+    assert train(resumed, replace(once, windows="host", workers=1), progress=False).step == 4
+    assert same_weights(networks["host"], resumed)
+
+
+def test_windows_go_to_a_gpu_by_themselves(tiny_dataset, tmp_path, monkeypatch):
+    """Where they fit; else one line says why the host draws them. Asked for, they have to."""
+    run, _ = settled(settings(tiny_dataset, tmp_path / "r"))
+    windows, _ = make_windows(run, 4)
+    here = Process(0, 1, torch.device("cpu"))
+    assert training.on_its_device(windows, run, here) == (None, [])
+    monkeypatch.setattr(training, "is_gpu", lambda device: True)
+    held, lines = training.on_its_device(windows, run, here)
+    assert held is not None
+    assert lines == ["windows are drawn on the device, which holds 0.000133 GB of light"]
+    assert training.on_its_device(windows, replace(run, windows="host"), here) == (None, [])
+    monkeypatch.setattr(training, "light_memory", lambda device: 1000)
+    why = "their light is 0.000133 GB, and 1e-06 GB are for it"
+    assert training.on_its_device(windows, run, here) == (None, [f"windows are drawn on the host: {why}"])
+    with pytest.raises(ValueError, match=f"windows=device: no device draws these windows: {why}; leave it out"):
+        training.on_its_device(windows, replace(run, windows="device"), here)
 
 
 @pytest.mark.slow

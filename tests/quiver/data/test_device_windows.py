@@ -1,0 +1,217 @@
+"""Windows that are drawn on a device: those of the host to the bit, without a question to the device."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from clips import ClipMaker
+from torch.utils.data import DataLoader, default_collate
+from waiting import listed_waits
+
+from qsim import Camera, keys
+from qsim.keys import Key
+from qsim.sensor.counting import CountingSPAD
+from quiver.data import device_windows, numpy_sums
+from quiver.data.code_table import draw_codes
+from quiver.data.device_windows import DeviceWindows, Unfit, _law_of
+from quiver.data.device_words import uniform, words
+from quiver.data.illumination import Illumination
+from quiver.data.windows import Batches, Windows, WindowSettings
+
+CPU = torch.device("cpu")
+PLENTY = 10**9  # bytes
+LIGHTS = (
+    Illumination.of(ppp=3.25),
+    Illumination.of(ppp=0.3),
+    Illumination.of("quiver-published", ppp=26.0, bits=5),
+    Illumination.of("spad-320x240", ppp=1.0, bits=1),
+    Illumination.of("spad-320x240", ppp=4.9, bits=3),
+    Illumination.of(ppp=100.0, bits=7),
+)
+
+
+def some_clips(make_clip: ClipMaker) -> list[Any]:
+    """Clips of several sizes, with and without sharp frames, a camera and vignetting."""
+    wide = {"camera": vars(Camera(2e-3, 1.8, 3.2e-6, 40, 52, vignetting=True))}
+    return [
+        make_clip("plain", seed=0),
+        make_clip("sharp", seed=1, sharp=True, height=40, width=37),
+        make_clip("relative", seed=2, relative=True, frames=17),
+        make_clip("dark", seed=3, height=40, width=52, **wide, sharp=True),
+        make_clip("crop", seed=4, height=36, width=44, **wide, origin=[4, 8]),
+    ]
+
+
+def same(found: dict[str, Any], wanted: dict[str, Any]) -> None:
+    """Compare two batches, to the bit."""
+    assert set(found) == set(wanted)
+    for name, value in wanted.items():
+        if isinstance(value, torch.Tensor):
+            assert found[name].dtype == value.dtype, name
+            assert torch.equal(found[name].cpu(), value), name
+        else:
+            assert found[name] == value, name
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_windows_of_a_device_are_those_of_the_host(make_clip: ClipMaker, seed: int):
+    """Random settings: sizes, turns, drift, sensors, light, ceilings, one clip or several."""
+    rng = np.random.default_rng(seed)
+    clips = some_clips(make_clip)
+    lights = tuple(LIGHTS[i] for i in rng.permutation(len(LIGHTS))[: rng.integers(1, 4)])
+    settings = WindowSettings(
+        lights=lights,
+        frames=int(rng.integers(1, 13)),
+        crop=int(rng.integers(1, 34)),
+        flips=bool(rng.integers(2)),
+        reverse=bool(rng.integers(2)),
+        drift=int(rng.integers(4)),
+        ceiling=float(rng.uniform(0.3, 4)),
+        force_exposure=bool(rng.integers(2)),
+        seed=seed,
+    )
+    chosen = [clips[i] for i in rng.permutation(len(clips))[: rng.integers(1, 6)]]
+    windows = Windows(chosen, settings, repeats=3)
+    device = DeviceWindows(windows, CPU, PLENTY)
+    for _ in range(3):
+        numbers = [int(n) for n in rng.integers(0, 10**6, rng.integers(1, 6))]
+        found = device.draw(default_collate([device.places[n] for n in numbers]))
+        same(found, default_collate([windows[n] for n in numbers]))
+
+
+def test_every_turn_and_light_occurs(make_clip: ClipMaker):
+    """The windows above are all kinds: eight turns, both directions, drifts, lights."""
+    settings = WindowSettings(lights=LIGHTS, crop=12, drift=2)
+    windows = Windows(some_clips(make_clip), settings)
+    device = DeviceWindows(windows, CPU, PLENTY)
+    numbers = list(range(160))
+    places = [windows.place(n) for n in numbers]
+    assert len({(place.turn, place.backwards, place.drift != (0, 0)) for place in places}) == 32
+    assert {place.light for place in places} == set(range(len(LIGHTS)))
+    same(
+        device.draw(default_collate([device.places[n] for n in numbers])),
+        default_collate([windows[n] for n in numbers]),
+    )
+
+
+def test_a_loader_of_places_draws_the_batches_of_a_loader_of_windows(make_clip: ClipMaker):
+    windows = Windows(some_clips(make_clip), WindowSettings(crop=16))
+    device = DeviceWindows(windows, CPU, PLENTY)
+    batches = Batches(3, 2, 5)
+    loaded = zip(
+        DataLoader(device.places, batch_sampler=batches), DataLoader(windows, batch_sampler=batches), strict=True
+    )
+    for places, wanted in loaded:
+        same(device.draw(places), wanted)
+
+
+def test_words_are_those_of_the_keys():
+    """Of every size up to two blocks of columns, of two redraws, under keys of all bits."""
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        shape = tuple(int(n) for n in rng.integers(1, 10, 3))
+        some = [Key(int(rng.integers(100)), int(n), stage=1) for n in rng.integers(0, 1 << 40, 2)]
+        halves = torch.tensor([divmod(key.philox_key, 1 << 32) for key in some])
+        found = words(*halves.unbind(1), shape, redraws=2)
+        for i, key in enumerate(some):
+            first, second = (keys.words(key, shape, redraw=r) for r in (0, 1))
+            assert np.array_equal(found[i, 0].numpy(), first)
+            assert np.array_equal(found[i, 1].numpy(), second)
+            assert np.array_equal(uniform(*found[i]).numpy(), keys.uniform(first, second))
+
+
+def test_sums_are_those_of_numpy():
+    """Of rows of all lengths up to several halvings, and of those of windows."""
+    rng = np.random.default_rng(5)
+    for count in (*range(1, 40), *rng.integers(40, 5000, 60), 11 * 64 * 64, 21 * 30 * 30):
+        rows = rng.exponential(1.0, (2, int(count)))
+        assert np.array_equal(numpy_sums.total(torch.from_numpy(rows)).numpy(), [row.sum() for row in rows])
+        assert np.array_equal(numpy_sums.mean(torch.from_numpy(rows)).numpy(), [row.mean() for row in rows])
+
+
+@pytest.mark.parametrize("light", LIGHTS, ids=lambda light: light.label)
+def test_a_million_codes_over_all_light_are_those_of_the_reference(make_clip: ClipMaker, light: Illumination):
+    """Photons from none to far beyond the brightest, each drawn by the cubics and by `draw_codes`."""
+    clip = make_clip()
+    windows = Windows([clip], WindowSettings(lights=(light,), crop=4, frames=1))
+    device = DeviceWindows(windows, CPU, PLENTY)
+    sensor = windows.noise.noises[0].draw(clip).sensor
+    white = sensor.white(clip.exposure)
+    rng = np.random.default_rng(1)
+    photons = white * 10.0 ** rng.uniform(-6, 2.5, (4, 500, 500))
+    photons[0, :5] = 0
+    key = Key(3, 4)
+    halves = torch.tensor([divmod(key.philox_key, 1 << 32)])
+    row = device.numbers[:, 3][:, None, None, None], device.integers[:, 6], device.integers[:, 7]
+    drawn = words(*halves.unbind(1), photons.shape, redraws=2)
+    found = device._codes(torch.from_numpy(photons)[None], *row, drawn)
+    wanted = draw_codes(sensor, photons, clip.exposure, key)
+    assert np.array_equal(found[0].numpy(), wanted)
+
+
+def test_words_near_a_step_are_decided_by_64_bits(make_clip: ClipMaker):
+    """Where the first word lies within its last digit of a step, the second decides, as in the reference."""
+    clip = make_clip()
+    windows = Windows([clip], WindowSettings(crop=4, frames=1))
+    device = DeviceWindows(windows, CPU, PLENTY)
+    sensor = windows.noise.noises[0].draw(clip).sensor
+    rng = np.random.default_rng(2)
+    photons = rng.uniform(0, 20, 4000)
+    steps = sensor.cdf(photons, clip.exposure)[np.arange(4000), rng.integers(0, 7, 4000)]
+    first = np.floor(steps * 2.0**32).clip(0, 2**32 - 1).astype(np.uint32)
+    second = rng.integers(0, 2**32, 4000, dtype=np.uint64).astype(np.uint32)
+    wanted = sensor.draw(photons, clip.exposure, first, lambda some: second[some])
+    drawn = torch.from_numpy(np.stack([first, second]).astype(np.int64))[None, :, None, None]
+    row = device.numbers[:, 3][:, None, None, None], device.integers[:, 6], device.integers[:, 7]
+    found = device._codes(torch.from_numpy(photons)[None, None, None], *row, drawn)
+    assert np.array_equal(found.flatten().numpy(), wanted)
+
+
+def test_a_batch_waits_for_nothing_whatever_its_size(make_clip: ClipMaker):
+    """On `meta`, where a look at a value is an error. The count of operators is that of launches, at most."""
+    settings = WindowSettings(lights=LIGHTS[:4], crop=16, drift=2, force_exposure=True)
+    windows = Windows(some_clips(make_clip), settings)
+    device = DeviceWindows(windows, CPU, PLENTY)
+    for name in ("light", "gains", "cubics", "integers", "numbers", "turned"):
+        setattr(device, name, getattr(device, name).to("meta"))
+    device.device = torch.device("meta")
+    counts = []
+    for batch in (2, 64):
+        place = torch.empty(batch, 10, dtype=torch.int64, device="meta")
+        with listed_waits() as (waits, operators):
+            found = device.drawn(place)
+        assert found["codes"].shape == (batch, 11, 1, 16, 16)
+        assert waits == []
+        counts.append(operators.count)
+    assert counts[0] == counts[1] < 300
+
+
+def unfit(problem: str, windows: Windows, memory: int = PLENTY) -> None:
+    with pytest.raises(Unfit, match=problem):
+        DeviceWindows(windows, CPU, memory)
+
+
+def test_windows_that_no_device_draws_say_why(make_clip: ClipMaker, tmp_path: Path):
+    clips = [make_clip("a"), make_clip("b", seed=1, sharp=True)]
+    plain = WindowSettings(crop=16)
+    unfit("copies at rest", Windows(clips, replace(plain, still=True)))
+    unfit("computed where windows are drawn", Windows(clips, plain, prepare=lambda codes: {}))
+    planes = Illumination.of("spad-320x240", ppp=1.0, bits=2).over(3)
+    unfit("codes of several or late exposures", Windows(clips, replace(plain, frames=4, lights=(planes,))))
+    unfit("their light is 0.000133 GB, and 0.0001 GB are for it", Windows(clips, plain), 100_000)
+    unfit(r"and its laws are 0.0075 GB, and 0.0002 GB are for them", Windows(clips, plain), 200_000)
+
+
+def test_laws_that_are_no_cubics_are_refused(monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(Unfit, match="fall again with light"):
+        _law_of(CountingSPAD(0.5, 200.0, 2e-5, 3, paralyzable=True), 5e-4)
+    with pytest.raises(Unfit, match="codes of 8 bits have too many steps"):
+        _law_of(CountingSPAD(0.5, 0.0, 0.0, 8), 5e-4)
+    monkeypatch.setattr(device_windows, "CELLS", 64)
+    with pytest.raises(Unfit, match="are no cubics: they differ by"):
+        _law_of(CountingSPAD(0.5, 0.0, 0.0, 4), 5e-4)
