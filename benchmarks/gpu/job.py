@@ -12,7 +12,7 @@ from typing import Any
 from folder import read, write
 from sizes import Sizes
 
-SECTIONS = ("doctor", "sensor", "render", "train", "restore")
+SECTIONS = ("doctor", "sensor", "render", "steps", "train", "restore")
 SAVING = 20.0  # s before the end of its time at which a resumable measurement stops, at most a fifth of it
 MARGIN = 1.25  # times its longest part: the time that a resumable measurement needs for another
 

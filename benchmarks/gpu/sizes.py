@@ -28,6 +28,17 @@ class Sizes:
     crop: int | None = None  # px; None: that of the protocol
     batch: int | None = None  # None: that of the protocol
     steps: int = 1000  # of every training
+    step_batches: tuple[int, ...] = (8, 16, 32, 64, 128)  # windows of the steps that are timed without a loader
+    step_frames: tuple[int, ...] = (11, 21)  # of their windows
+    compiled: tuple[str, ...] = ("off", "kernels", "graphs")  # ways of torch.compile; each takes minutes
+    compiled_batch: int = 16  # windows of these steps
+    step_crop: int = 64  # px
+    counted_crop: int = 16  # px, of the steps whose operators are counted
+    step_height: int = 256  # px, of their clips
+    step_width: int = 256
+    step_count: int = 10  # steps of a round
+    window_batch: int = 32  # windows of the steps whose loader is timed
+    peak_side: int = 8192  # of the matrices whose product is the peak
     copied_batches: int = 40  # batches that are timed for every way of copying
     workers: int = 8  # processes that draw windows, at most one less than the cores
     restored: int = 16  # frames of a network that are timed on a GPU

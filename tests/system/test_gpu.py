@@ -545,6 +545,16 @@ TINY = {
     "crop": 32,
     "batch": 1,
     "steps": 2,
+    "step_batches": [1, 2],
+    "step_frames": [11, 12],
+    "compiled": ["off"],
+    "compiled_batch": 1,
+    "step_crop": 16,
+    "step_height": 24,
+    "step_width": 28,
+    "step_count": 1,
+    "window_batch": 2,
+    "peak_side": 64,
     "copied_batches": 2,
     "restored": 2,
     "restored_slow": 2,
@@ -559,7 +569,7 @@ ABSENT = {  # without a GPU
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("section", ["doctor", "sensor", "render", "train", "restore"])
+@pytest.mark.parametrize("section", ["doctor", "sensor", "render", "steps", "train", "restore"])
 def test_a_section_measures_on_this_machine_at_tiny_sizes(tmp_path, monkeypatch, section):
     """Without a GPU the CPU's form of everything is made, and what needs CUDA is absent with its reason."""
     monkeypatch.syspath_prepend(str(PARTS))
@@ -614,6 +624,24 @@ def _render(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
     assert rows["validate-llvm-fan"][0]["asked [dB]"] == 40
 
 
+def _steps(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
+    assert {"windows", "batches-11-float32", "batches-12-float32", "compiled"} <= set(rows)
+    alone = {row["batch"]: row for row in rows["batches-11-float32"]}
+    pairs = {row["batch"]: row for row in rows["batches-12-float32"]}
+    for row in (*alone.values(), *pairs.values()):
+        assert row["windows per s"] == pytest.approx(row["batch"] * row["steps per s"])
+        assert row["share of peak"] > 0
+    assert set(alone) == set(pairs) == {1, 2}
+    cost = "multiply-adds per restored pixel [M]"
+    assert alone[2][cost] == alone[1][cost] > 1.5 * pairs[1][cost]  # two neighbours share work
+    assert all(0 < row["share of drawing"] < 0.2 for row in rows["operators"])
+    assert [row["compile"] for row in rows["compiled"]] == ["off"]
+    assert {row["windows drawn by"]: row["ms of drawing alone"] is not None for row in rows["windows"]} == {
+        "device": True,
+        "host": False,
+    }
+
+
 def _train(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
     from restore import weights_of
 
@@ -646,4 +674,11 @@ def _restore(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
     assert errors["quiver-s"][1] > 1e-3
 
 
-CHECKS = {"doctor": _doctor, "sensor": _sensor, "render": _render, "train": _train, "restore": _restore}
+CHECKS = {
+    "doctor": _doctor,
+    "sensor": _sensor,
+    "render": _render,
+    "steps": _steps,
+    "train": _train,
+    "restore": _restore,
+}
