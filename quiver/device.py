@@ -41,10 +41,16 @@ def default_memory(kind: str) -> int:
 
 
 def light_memory(device: torch.device) -> int:
-    """Return the memory [bytes] for the light of training clips: LIGHT_SHARE of a GPU's, else HOST_MEMORY."""
+    """Return the memory [bytes] for the light of training clips: LIGHT_SHARE of a GPU's, else HOST_MEMORY.
+
+    Of a GPU that others use it is at most half of what is free.
+    """
     import torch
 
-    return int(LIGHT_SHARE * torch.cuda.mem_get_info(device)[1]) if is_gpu(device) else HOST_MEMORY
+    if not is_gpu(device):
+        return HOST_MEMORY
+    free, total = torch.cuda.mem_get_info(device)
+    return min(int(LIGHT_SHARE * total), free // 2)
 
 
 def device_of_process(kind: str) -> torch.device:

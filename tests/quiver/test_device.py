@@ -85,3 +85,36 @@ def test_working_memory_is_half_of_a_gpu_for_what_runs_there(monkeypatch):
         assert options.bound() == options.bound(host=True) == stated
     with pytest.raises(ValueError, match="memory: expected a whole number from 1, got 0"):
         RestoreOptions(memory=0)
+
+
+def test_light_of_clips_has_a_share_of_a_gpu_and_at_most_half_of_what_is_free(monkeypatch):
+    gpu = torch.device("cuda", 1)
+    assert device.light_memory(CPU) == 2 * 10**9
+    for free, expected in ((70, 32), (10, 5)):
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda place, free=free: (free * 10**9, 80 * 10**9))
+        assert device.light_memory(gpu) == expected * 10**9
+
+
+def test_a_reading_asks_a_gpu_when_its_values_are_needed(monkeypatch):
+    """Not when it is made: the copy is begun and an event is recorded behind it."""
+    done = []
+
+    class Event:
+        def record(self) -> None:
+            done.append("recorded")
+
+        def synchronize(self) -> None:
+            done.append("waited")
+
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(device, "is_gpu", lambda place: True)
+    empty = torch.empty
+    monkeypatch.setattr(torch, "empty", lambda *shape, dtype, pin_memory: empty(*shape, dtype=dtype))
+    reading = device.Reading(torch.tensor([1.5, 2.0]))
+    assert done == ["recorded"]
+    assert reading.values() == [1.5, 2.0]
+    assert done == ["recorded", "waited"]
+
+
+def test_only_a_gpu_lets_its_host_run_ahead():
+    assert (device.steps_ahead(CPU), device.steps_ahead(torch.device("cuda"))) == (0, device.AHEAD)

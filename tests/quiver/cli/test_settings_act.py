@@ -278,11 +278,12 @@ COMMANDS = Commands(
         "output": names,
         "accumulate": described,
         "compile": described,
+        "windows": described,
         "restore.frame_rate": described,
         "memory": seen("read"),
         "workers": seen("workers"),
     },
-    may_be_silent=frozenset({"scan", "threads", "force", "memory", "workers", "strict"}),
+    may_be_silent=frozenset({"scan", "threads", "force", "memory", "workers", "windows", "strict"}),
     prepared=frozenset({"validate_every", "validation_split", "minutes"}),
     never_here={
         **{f"{command}.device": "no other device is here" for command in COMPUTING},
