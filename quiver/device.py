@@ -101,6 +101,11 @@ class Reading:
         return list(map(float, self.host.tolist()))
 
 
+def pinned(tensor: Tensor, device: torch.device) -> Tensor:
+    """Return a tensor of the host in memory from which copies to this device do not wait."""
+    return tensor.pin_memory() if is_gpu(device) else tensor
+
+
 def wait(device: torch.device) -> None:
     """Wait until the device has finished its work, before a clock is read or another library uses its memory."""
     import torch

@@ -61,6 +61,8 @@ VALIDATION = 2
 STILL = 3
 SHUFFLED = 1 << 16  # numbers of an epoch that are shuffled together
 DARKEST = 1e-9  # photons, least mean of a window that is brought to a light level
+POOLED = 5  # a part of seeds
+STAY = 256  # samples after which a pool takes one more clip, and loses one
 KEPT = 256  # clips that stay open, with what draws their codes
 # Turns that keep the direction in which rows (0) or columns (1) are read: none, and mirrored along them
 TURNS_OF_ROWS = ((0, 4), (0, 6))
@@ -78,6 +80,7 @@ class WindowSettings:
     reverse: bool = True  # half of the windows run backwards in time
     drift: int = 0  # px/frame; in half of the windows the crop moves, up to this far along each side
     force_exposure: bool = False  # published: every window is brought to the light level separately
+    pool: int | None = None  # clips that windows are drawn from at a time; None: all
     still: bool = False  # items also hold noisy copies of the centre frame, drawn without defects
     ceiling: float = 2.0  # of targets, in units of white, or the peak of the scores where that is more
     seed: int = 0
@@ -85,6 +88,8 @@ class WindowSettings:
     def __post_init__(self) -> None:
         if self.frames < 1 or self.crop < 1:
             raise ValueError(f"WindowSettings: frames and crop must be at least 1, got {self.frames} and {self.crop}")
+        if self.pool is not None and self.pool < 1:
+            raise ValueError(f"WindowSettings: pool must be at least 1, got {self.pool}")
         if self.lights is not None and not self.lights:
             raise ValueError("WindowSettings.lights is empty; give at least one light level, or None for the streams'")
 
@@ -196,8 +201,24 @@ class Windows(Dataset[dict[str, Any]]):
 
     def clip_of(self, n: int) -> int:
         """Return the number of the clip that sample n draws."""
+        if self.settings.pool is not None:
+            return self.clip_at(self.position_of(n))
         epoch, index = divmod(n, self.length)
         return shuffled(self.length, (self.settings.seed, epoch), index) % len(self.clips)
+
+    def position_of(self, n: int) -> int:
+        """Return which clip of the endless row of `clip_at` sample n draws: one of the `pool` that are in turn.
+
+        After STAY samples the first one of them leaves, and the next one comes.
+        """
+        assert self.settings.pool is not None
+        rng = np.random.default_rng((self.settings.seed, n, POOLED))
+        return n // STAY + int(rng.integers(self.settings.pool))
+
+    def clip_at(self, position: int) -> int:
+        """Return the number of a clip in an endless row: all clips in random order, then all in another."""
+        epoch, index = divmod(position, len(self.clips))
+        return shuffled(len(self.clips), (self.settings.seed, epoch), index)
 
     def _drift(self, clip: int, rng: np.random.Generator) -> tuple[int, int]:
         """Return the drift of the crop [px/frame], limited by the size of the clip."""

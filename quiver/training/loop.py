@@ -32,7 +32,8 @@ from qsim.keys import Key
 from qsim.terminal import Tolerant
 from quiver import threads
 from quiver.data.clips import clips_digest, split_clips, unfinished
-from quiver.data.device_windows import DeviceWindows, Unfit
+from quiver.data.device_light import Unfit
+from quiver.data.device_windows import DeviceWindows
 from quiver.data.growing import GrowingWindows
 from quiver.data.illumination import OTHERS
 from quiver.data.stream_windows import StreamWindows
@@ -93,6 +94,7 @@ def make_windows(
         drift=settings.drift,
         force_exposure=settings.force_exposure,
         still=system.still,
+        pool=settings.pool,
         seed=settings.seed,
         least=least,
     )
@@ -101,6 +103,8 @@ def make_windows(
         training, validation = split_clips(settings.data, settings.validation_split)
         windows = Windows(training, window, prepare=system.prepare)
     else:
+        if settings.pool is not None:
+            raise ValueError(f"pool={settings.pool}: windows of a recipe are of all finished clips; leave it out")
         training, validation = rendering.clips()
         schedule = rendering.schedule(Path(settings.out) / SCHEDULE)
         windows = GrowingWindows(training, window, schedule, prepare=system.prepare)
@@ -113,7 +117,9 @@ def make_windows(
         warnings.warn(f"{names}: no clip in split '{split}'; validating on training clips", stacklevel=2)
         validation = training
     side = min(VALIDATION_SIDE, *(min(clip.shape[1:]) for clip in validation.alike())) // multiple * multiple
-    middle = replace(window, drift=0, frames=frames or system.frames, crop=max(side, multiple), ceiling=math.inf)
+    middle = replace(
+        window, drift=0, pool=None, frames=frames or system.frames, crop=max(side, multiple), ceiling=math.inf
+    )
     fixed = Windows(validation, middle, fixed=True, prepare=system.prepare)
     return windows, Subset(fixed, fixed.spread(settings.validation_windows))
 
@@ -150,7 +156,7 @@ def on_its_device(windows: AnyWindows, settings: Settings, process: Process) -> 
         if settings.windows == "device":
             raise ValueError(f"windows=device: no device draws these windows: {error}; leave it out") from None
         return None, [f"windows are drawn on the host: {error}"]
-    return found, [f"windows are drawn on the device, which holds {2 * found.light.numel() / 1e9:.3g} GB of light"]
+    return found, [f"windows are drawn on the device, which holds {found.held.light.nbytes / 1e9:.3g} GB of light"]
 
 
 def batches(

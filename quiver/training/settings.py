@@ -138,6 +138,9 @@ class Settings:
         Literal["auto", "host", "device"],
         setting("where windows are drawn", unset="auto: on a GPU if it can and holds the clips"),
     ] = "auto"  # the same windows, see device_windows.py
+    pool: Annotated[
+        Whole | None, setting("clips that windows are drawn from at a time; they turn over", unset="all")
+    ] = None
     scan: Wanted = None
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"],

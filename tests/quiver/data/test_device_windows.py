@@ -16,12 +16,14 @@ from waiting import listed_waits
 from qsim import Camera, keys
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
-from quiver.data import device_windows, numpy_sums
+from quiver.data import device_light, numpy_sums
+from quiver.data import windows as drawing
 from quiver.data.code_table import draw_codes
-from quiver.data.device_windows import DeviceWindows, Unfit, _law_of
+from quiver.data.device_light import Unfit, _law_of, size_of
+from quiver.data.device_windows import SPARE, DeviceWindows
 from quiver.data.device_words import uniform, words
 from quiver.data.illumination import Illumination
-from quiver.data.windows import Batches, Windows, WindowSettings
+from quiver.data.windows import STAY, Batches, Windows, WindowSettings
 
 CPU = torch.device("cpu")
 PLENTY = 10**9  # bytes
@@ -99,6 +101,37 @@ def test_every_turn_and_light_occurs(make_clip: ClipMaker):
     )
 
 
+@pytest.mark.parametrize("pool", [1, 3, 7])
+def test_a_pool_of_clips_turns_over_alike_on_host_and_device(make_clip: ClipMaker, monkeypatch, pool: int):
+    """Batch after batch, from another place on, and far away; a pool may be larger than the data set."""
+    monkeypatch.setattr(drawing, "STAY", 5)
+    monkeypatch.setattr("quiver.data.device_windows.STAY", 5)
+    clips = some_clips(make_clip)
+    windows = Windows(clips, WindowSettings(crop=8, frames=3, pool=pool, lights=LIGHTS[:2]))
+    device = DeviceWindows(windows, CPU, PLENTY)
+    assert len(device.held.light) == (pool + SPARE) * max(size_of(clip) for clip in clips)
+    for start in (*range(0, 60, 6), *range(33, 60, 6), 10**6):
+        numbers = range(start, start + 6)
+        found = device.draw(default_collate([device.places[n] for n in numbers]))
+        same(found, default_collate([windows[n] for n in numbers]))
+    with pytest.raises(ValueError, match="more than 20 windows from first to last"):
+        device.draw(default_collate([device.places[n] for n in (0, 40)]))
+
+
+def test_every_clip_of_a_pool_stays_and_leaves(make_clip: ClipMaker):
+    """A sample draws one of `pool` clips; each of all clips comes equally often, and stays for pool * STAY samples."""
+    clips = [make_clip(f"c{i}", seed=i) for i in range(4)]
+    windows = Windows(clips, WindowSettings(crop=8, pool=2, seed=3))
+    positions = [windows.position_of(n) for n in range(40 * STAY)]
+    for n, position in enumerate(positions):
+        assert n // STAY <= position < n // STAY + 2
+    assert {windows.clip_at(position) for position in range(4)} == {0, 1, 2, 3}
+    counts = np.bincount([windows.clip_of(n) for n in range(40 * STAY)])
+    assert np.ptp(counts) < 0.25 * counts.mean()
+    with pytest.raises(ValueError, match="pool must be at least 1, got 0"):
+        WindowSettings(pool=0)
+
+
 def test_a_loader_of_places_draws_the_batches_of_a_loader_of_windows(make_clip: ClipMaker):
     windows = Windows(some_clips(make_clip), WindowSettings(crop=16))
     device = DeviceWindows(windows, CPU, PLENTY)
@@ -147,7 +180,7 @@ def test_a_million_codes_over_all_light_are_those_of_the_reference(make_clip: Cl
     photons[0, :5] = 0
     key = Key(3, 4)
     halves = torch.tensor([divmod(key.philox_key, 1 << 32)])
-    row = device.numbers[:, 3][:, None, None, None], device.integers[:, 6], device.integers[:, 7]
+    row = device.held.numbers[:, 3][:, None, None, None], device.held.integers[:, 6], device.held.integers[:, 7]
     drawn = words(*halves.unbind(1), photons.shape, redraws=2)
     found = device._codes(torch.from_numpy(photons)[None], *row, drawn)
     wanted = draw_codes(sensor, photons, clip.exposure, key)
@@ -167,7 +200,7 @@ def test_words_near_a_step_are_decided_by_64_bits(make_clip: ClipMaker):
     second = rng.integers(0, 2**32, 4000, dtype=np.uint64).astype(np.uint32)
     wanted = sensor.draw(photons, clip.exposure, first, lambda some: second[some])
     drawn = torch.from_numpy(np.stack([first, second]).astype(np.int64))[None, :, None, None]
-    row = device.numbers[:, 3][:, None, None, None], device.integers[:, 6], device.integers[:, 7]
+    row = device.held.numbers[:, 3][:, None, None, None], device.held.integers[:, 6], device.held.integers[:, 7]
     found = device._codes(torch.from_numpy(photons)[None, None, None], *row, drawn)
     assert np.array_equal(found.flatten().numpy(), wanted)
 
@@ -177,8 +210,9 @@ def test_a_batch_waits_for_nothing_whatever_its_size(make_clip: ClipMaker):
     settings = WindowSettings(lights=LIGHTS[:4], crop=16, drift=2, force_exposure=True)
     windows = Windows(some_clips(make_clip), settings)
     device = DeviceWindows(windows, CPU, PLENTY)
-    for name in ("light", "gains", "cubics", "integers", "numbers", "turned"):
-        setattr(device, name, getattr(device, name).to("meta"))
+    for name in ("light", "gains", "cubics", "integers", "numbers"):
+        setattr(device.held, name, getattr(device.held, name).to("meta"))
+    device.turned = device.turned.to("meta")
     device.device = torch.device("meta")
     counts = []
     for batch in (2, 64):
@@ -204,7 +238,7 @@ def test_windows_that_no_device_draws_say_why(make_clip: ClipMaker, tmp_path: Pa
     planes = Illumination.of("spad-320x240", ppp=1.0, bits=2).over(3)
     unfit("codes of several or late exposures", Windows(clips, replace(plain, frames=4, lights=(planes,))))
     unfit("their light is 0.000133 GB, and 0.0001 GB are for it", Windows(clips, plain), 100_000)
-    unfit(r"and its laws are 0.0075 GB, and 0.0002 GB are for them", Windows(clips, plain), 200_000)
+    unfit(r"and its laws are 0.00749 GB, and 0.0002 GB are for them", Windows(clips, plain), 200_000)
 
 
 def test_laws_that_are_no_cubics_are_refused(monkeypatch: pytest.MonkeyPatch):
@@ -212,6 +246,6 @@ def test_laws_that_are_no_cubics_are_refused(monkeypatch: pytest.MonkeyPatch):
         _law_of(CountingSPAD(0.5, 200.0, 2e-5, 3, paralyzable=True), 5e-4)
     with pytest.raises(Unfit, match="codes of 8 bits have too many steps"):
         _law_of(CountingSPAD(0.5, 0.0, 0.0, 8), 5e-4)
-    monkeypatch.setattr(device_windows, "CELLS", 64)
+    monkeypatch.setattr(device_light, "CELLS", 64)
     with pytest.raises(Unfit, match="are no cubics: they differ by"):
         _law_of(CountingSPAD(0.5, 0.0, 0.0, 4), 5e-4)

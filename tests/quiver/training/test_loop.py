@@ -506,6 +506,20 @@ def test_windows_drawn_on_a_device_train_the_same_weights(tiny_dataset, tmp_path
     assert same_weights(networks["host"], resumed)
 
 
+def test_windows_of_a_pool_train_the_same_weights_in_both_places(tiny_dataset, tmp_path, monkeypatch):
+    """Other weights than those of all clips; a resumed run has the pool that it began with."""
+    for module in ("windows", "device_windows"):
+        monkeypatch.setattr(f"quiver.data.{module}.STAY", 2)
+    networks = {name: small_network() for name in ("host", "device", "all")}
+    for name, network in networks.items():
+        kind = {"windows": "host"} if name == "all" else {"windows": name, "pool": 1}
+        train(network, settings(tiny_dataset, tmp_path / name, steps=4, **kind), progress=False)
+    assert same_weights(networks["host"], networks["device"])
+    assert not same_weights(networks["host"], networks["all"])
+    with pytest.raises(FileExistsError, match="holds a run with pool 1, now it is 2"):
+        train(small_network(), settings(tiny_dataset, tmp_path / "host", steps=4, pool=2), progress=False)
+
+
 def test_windows_go_to_a_gpu_by_themselves(tiny_dataset, tmp_path, monkeypatch):
     """Where they fit; else one line says why the host draws them. Asked for, they have to."""
     run, _ = settled(settings(tiny_dataset, tmp_path / "r"))
