@@ -6,6 +6,8 @@
 Every stage agrees with the published network (tests/quiver/model/test_golden.py).
 """
 
+from __future__ import annotations  # a type that is computed inside of a call would cut a compiled network in two
+
 from collections.abc import Callable, Sequence
 
 import torch

@@ -1,7 +1,7 @@
 """Compiles a network for its training steps with `torch.compile`.
 
     kernels  neighbouring operations become one kernel
-    graphs   and their launches are recorded once and replayed: CUDA graphs, for networks of many small kernels
+    graphs   launches are recorded once and replayed: CUDA graphs, for networks of many small kernels
 
 Weights are shared with the network as it is, by which validations and files go.
 """
@@ -14,17 +14,17 @@ from typing import Any
 import torch
 from torch import nn
 
-MODES = {"kernels": "default", "graphs": "reduce-overhead"}  # of torch.compile
+BACKENDS = {"kernels": "inductor", "graphs": "cudagraphs"}  # of torch.compile
 
 
 class Compiled:
     """A network that torch compiles when it is called; its other methods run as they are."""
 
     def __init__(self, network: nn.Module, kind: str) -> None:
-        """`kind` is a key of MODES."""
+        """`kind` is a key of BACKENDS."""
         self.network = network
         self.kind = kind
-        self.form: Callable[..., Any] = torch.compile(network, mode=MODES[kind])
+        self.form: Callable[..., Any] = torch.compile(network, backend=BACKENDS[kind])
         self.called = False
 
     def __call__(self, *given: Any, **named: Any) -> Any:

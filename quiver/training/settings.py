@@ -146,9 +146,9 @@ class Settings:
         Literal["auto", "float32", "bfloat16"],
         setting("precision", unset="auto: bfloat16 on CUDA; published protocols: float32"),
     ] = "auto"
-    compile: Annotated[
-        Literal["off", "kernels", "graphs"], setting("torch.compile: fused kernels, or CUDA graphs of them")
-    ] = "off"  # see compiling.py
+    compile: Annotated[Literal["off", "kernels", "graphs"], setting("torch.compile: fused kernels, or CUDA graphs")] = (
+        "off"  # see compiling.py
+    )
     seed: Annotated[Seed, setting("of weights, samples and noise")] = 0
     threads: Annotated[
         Whole | None,

@@ -447,10 +447,24 @@ def test_a_compiled_network_learns_the_same(tiny_dataset, tmp_path, kind):
     assert list(load(tmp_path / "b/last.safetensors").state_dict()) == list(plain.state_dict())
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_all_stages_of_quiver_are_one_graph():
+    """Of 21 frames, too: what cuts a graph would be launched piece by piece."""
+    graphs = []
+
+    def kept(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> object:
+        graphs.append(graph)
+        return graph.forward
+
+    torch.compile(QUIVER(TINY), backend=kept, fullgraph=True)(torch.rand(1, 21, 1, 16, 16))
+    assert len(graphs) == 1
+
+
 def test_what_does_not_compile_trains_without_it(tiny_dataset, tmp_path, monkeypatch):
     """With one line, and the weights of a run that never tried."""
 
-    def broken(network: nn.Module, mode: str) -> object:
+    def broken(network: nn.Module, backend: str) -> object:
         def called(*words: object) -> object:
             torch.rand(3)
             raise RuntimeError("no compiler\nlong trace")
