@@ -30,7 +30,7 @@ class Sizes:
     steps: int = 1000  # of every training
     step_batches: tuple[int, ...] = (8, 16, 32, 64, 128)  # windows of the steps that are timed without a loader
     step_frames: tuple[int, ...] = (11, 21)  # of their windows
-    compiled: tuple[str, ...] = ("off", "kernels", "graphs")  # ways of torch.compile; each takes minutes
+    compiled: tuple[str, ...] = ("off", "kernels", "graphs")  # ways of torch.compile
     compiled_batch: int = 16  # windows of these steps
     step_crop: int = 64  # px
     counted_crop: int = 16  # px, of the steps whose operators are counted

@@ -84,17 +84,19 @@ class _Bench:
     def seconds(self, step: Callable[[], None], count: int) -> float:
         """Return the median of the seconds of a step, of rounds of `count` steps that the device finishes."""
         from quiver.device import wait
+        from quiver.host import flushed_denormals
 
-        for _ in range(WARM):
-            step()
         found = []
-        for _ in range(3):
-            wait(self.place)
-            began = time.perf_counter()
-            for _ in range(count):
+        with flushed_denormals():  # as in a training
+            for _ in range(WARM):
                 step()
-            wait(self.place)
-            found.append((time.perf_counter() - began) / count)
+            for _ in range(3):
+                wait(self.place)
+                began = time.perf_counter()
+                for _ in range(count):
+                    step()
+                wait(self.place)
+                found.append((time.perf_counter() - began) / count)
         return median(found)
 
     def batch(self) -> dict[str, Any]:
