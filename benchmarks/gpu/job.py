@@ -12,7 +12,25 @@ from typing import Any
 from folder import read, write
 from sizes import Sizes
 
-SECTIONS = ("doctor", "sensor", "render", "steps", "train", "restore")
+SECTIONS = ("doctor", "equal", "sensor", "render", "steps", "train", "restore", "learn")
+# what a quarter of an hour measures, in order of worth: section, name, and the seconds that it may take; None: the rest
+QUARTER: tuple[tuple[str, str, float | None], ...] = (
+    ("doctor", "machine", 30),
+    ("equal", "codes", 30),
+    ("equal", "merge", 20),
+    ("equal", "classical", 30),
+    ("equal", "windows", 20),
+    ("equal", "network", 20),
+    ("sensor", "torch-cuda", 20),
+    ("sensor", "device-cuda", 30),
+    ("restore", "mergenet-float32", 40),
+    ("restore", "qbp-bm3d", 40),
+    ("render", "frame-cuda-fence", 40),
+    ("steps", "windows", 60),
+    ("steps", "batches-21-bfloat16", 60),
+    ("learn", "quiver-s", None),
+)
+QUARTER_MINUTES = 13.0
 SAVING = 20.0  # s before the end of its time at which a resumable measurement stops, at most a fifth of it
 MARGIN = 1.25  # times its longest part: the time that a resumable measurement needs for another
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from folder import ROOT, Wrong, opened, read, read_record, setup, write
-from job import SECTIONS
+from job import QUARTER, QUARTER_MINUTES, SECTIONS
 from wheels import install
 
 CHILD = (sys.executable, str(Path(__file__).with_name("child.py")))
@@ -36,6 +36,7 @@ class Piece:
     minutes: float
     sizes: dict[str, Any]  # what differs from the sizes in gpu/sizes.py
     child: tuple[str, ...]  # the command of a measurement
+    quarter: bool = False  # what a quarter of an hour measures, in its order
 
     @property
     def packages(self) -> Path:
@@ -51,9 +52,19 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument(
         "--section", choices=(*SECTIONS, "table"), help="measure one section; what failed in it is tried again"
     )
-    parser.add_argument("--minutes", type=_minutes, default=9.0, help="length of this piece (default 9)")
+    parser.add_argument(
+        "--quarter", action="store_true", help="what a quarter of an hour tells, in order of worth; then train QUIVER"
+    )
+    parser.add_argument(
+        "--minutes", type=_minutes, help=f"length of this piece (default 9; with --quarter {QUARTER_MINUTES:g})"
+    )
     parser.add_argument("--wheels", type=Path, help="folder of .whl files for packages that this machine lacks")
-    return parser.parse_args(argv)
+    given = parser.parse_args(argv)
+    if given.quarter and given.section is not None:
+        parser.error("--quarter has its own list of measurements; leave --section out")
+    if given.minutes is None:
+        given.minutes = QUARTER_MINUTES if given.quarter else 9.0
+    return given
 
 
 def _minutes(text: str) -> float:
@@ -176,9 +187,9 @@ def run(piece: Piece) -> int:
         lacking = [name for name, found in now["packages"].items() if found is None]
         gpus = ", ".join(here["gpus"]) or "no NVIDIA GPU"
         print(f"{here['processor']}, {here['cores']} cores, {gpus}; packages not here: {', '.join(lacking) or 'none'}")
-        plan = planned(piece)
-        chosen = [(s, n) for s, names in plan.items() if piece.section in (None, s) for n in names]
+        chosen = _chosen(piece)
         fixed = {"setup": now, "machine": here, "minutes": piece.minutes, "command": shown(piece)}
+        limits = {(section, name): most for section, name, most in QUARTER} if piece.quarter else {}
         todo = [one for one in chosen if is_open(record_of(piece, *one), piece, one[0], now)]
         for i, one in enumerate(todo):
             remaining = end - time.monotonic()
@@ -186,12 +197,21 @@ def run(piece: Piece) -> int:
                 break
             print(f"{one[0]}: {one[1]} ... ", end="", flush=True)
             started = time.monotonic()
-            state = measure(piece, *one, fixed, max(remaining, 1.0), first=i == 0)
+            most = limits.get(one)
+            state = measure(piece, *one, fixed, max(min(remaining, most or remaining), 1.0), first=i == 0)
             why = f": {(record_of(piece, *one) or {}).get('why')}" if state in ("failed", "late", "absent") else ""
             print(f"{state}, {time.monotonic() - started:.0f} s{why}", flush=True)
-            if state == "unfinished":  # its next part may not fit, and others may need it
+            if state == "unfinished" and not piece.quarter:  # its next part may not fit, and others may need it
                 break
         return summed_up(piece, chosen)
+
+
+def _chosen(piece: Piece) -> list[tuple[str, str]]:
+    """Return the measurements of this piece, section and name."""
+    if piece.quarter:
+        return [(section, name) for section, name, _ in QUARTER]
+    plan = planned(piece)
+    return [(s, n) for s, names in plan.items() if piece.section in (None, s) for n in names]
 
 
 def summed_up(piece: Piece, chosen: list[tuple[str, str]]) -> int:
@@ -213,14 +233,15 @@ def summed_up(piece: Piece, chosen: list[tuple[str, str]]) -> int:
 def shown(piece: Piece) -> str:
     """Return the command that makes such a piece."""
     section = f" --section {piece.section}" if piece.section else ""
-    return f"python benchmarks/gpu.py OUT{section} --minutes {piece.minutes:g}"
+    quarter = " --quarter" if piece.quarter else ""
+    return f"python benchmarks/gpu.py OUT{section}{quarter} --minutes {piece.minutes:g}"
 
 
 def main(argv: list[str] | None = None, *, sizes: dict[str, Any] | None = None, child: tuple[str, ...] = CHILD) -> int:
     """Run a command line; tests give smaller sizes, or another program in place of the measurements."""
     given = arguments(sys.argv[1:] if argv is None else argv)
     try:
-        piece = Piece(given.out.absolute(), given.section, given.minutes, sizes or {}, child)
+        piece = Piece(given.out.absolute(), given.section, given.minutes, sizes or {}, child, given.quarter)
         if given.wheels is not None:
             with opened(piece.out, piece.sizes):
                 install(given.wheels, piece.packages)

@@ -19,14 +19,23 @@ PLANE_PHOTONS = 0.7
 
 
 def names(sizes: Sizes) -> list[str]:
-    """Return a measurement for each engine, and for the usual lines of torch on each device."""
-    return ["engine-cuda", "engine-llvm", "torch-cpu", "torch-cuda"]
+    """Return a measurement for each engine, from host to host and on its device, and for the usual lines of torch."""
+    return ["engine-cuda", "engine-llvm", "device-cuda", "device-llvm", "torch-cpu", "torch-cuda"]
 
 
 def measure(job: Job) -> list[dict[str, Any]]:
     """Return rows of Gpixel/s, and for engines the largest share of codes that differ from the reference's."""
     kind, _, where = job.name.partition("-")
-    return _engine(where, job.sizes) if kind == "engine" else _torch(where, job.sizes)
+    if kind == "torch":
+        return _torch(where, job.sizes)
+    os.environ["QSIM_ENGINE"] = where
+    from qsim import backend
+
+    try:
+        backend.choose()
+    except ValueError as error:
+        raise Absent(str(error)) from None
+    return _engine(where, job.sizes) if kind == "engine" else _on_device(where, job.sizes)
 
 
 def _row(by: str, what: str, gigapixels: float, **more: Any) -> dict[str, Any]:
@@ -35,13 +44,6 @@ def _row(by: str, what: str, gigapixels: float, **more: Any) -> dict[str, Any]:
 
 
 def _engine(where: str, sizes: Sizes) -> list[dict[str, Any]]:
-    os.environ["QSIM_ENGINE"] = where
-    from qsim import backend
-
-    try:
-        backend.choose()
-    except ValueError as error:
-        raise Absent(str(error)) from None
     from qsim.studies.validation import sensors
 
     report = sensors.run(sizes.sensor_pixels)
@@ -57,7 +59,7 @@ def _engine(where: str, sizes: Sizes) -> list[dict[str, Any]]:
         rows.append(_row(where, host, fast.megapixels_per_second / 1e3, **more))
     checks = {"differing per million": different, "all checks": "passed" if report.ok else "NOT passed"}
     rows.append({"by": where, "what": "all sensors, the largest difference; `qsim validate sensor`"} | checks)
-    return rows + _on_device(where, sizes)
+    return rows
 
 
 def _on_device(where: str, sizes: Sizes) -> list[dict[str, Any]]:

@@ -39,6 +39,12 @@ class Sizes:
     step_count: int = 10  # steps of a round
     window_batch: int = 32  # windows of the steps whose loader is timed
     peak_side: int = 8192  # of the matrices whose product is the peak
+    learn_recipe: str = "scenes/starter.toml"  # of the repository, that is rendered while a network learns
+    learn_on_gpu: bool = True  # alone
+    learn_frames: int = 21  # of its windows
+    learn_batch: int = 32
+    learn_precision: str = "bfloat16"
+    learn_steps: int = 20_000  # at most
     copied_batches: int = 40  # batches that are timed for every way of copying
     workers: int = 8  # processes that draw windows, at most one less than the cores
     restored: int = 16  # frames of a network that are timed on a GPU

@@ -78,7 +78,7 @@ class _Bench:
         self.process = Process(0, 1, self.place)
         self.trainer = Trainer(network, Run(asked), None, self.process, system_of(network), self.said.append)
         window = WindowSettings(crop=sizes.step_crop, frames=frames, drift=asked.drift)
-        self.windows = Windows(_clips(job), window)
+        self.windows = Windows(clips_of_pattern(job), window)
         self.settings = asked
 
     def seconds(self, step: Callable[[], None], count: int) -> float:
@@ -108,7 +108,7 @@ class _Bench:
         return dict(on_device(default_collate([self.windows[n] for n in range(self.settings.batch)]), self.place))
 
 
-def _clips(job: Job) -> list[Any]:
+def clips_of_pattern(job: Job) -> list[Any]:
     """Return the clips of a moving pattern, written if they are missing."""
     import numpy as np
 

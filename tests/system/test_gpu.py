@@ -126,6 +126,7 @@ def test_importing_the_program_runs_nothing():
         (["--section", "rendering"], "invalid choice: 'rendering'"),
         (["another"], "unrecognized arguments: another"),
         (["--force"], "unrecognized arguments: --force"),
+        (["--quarter", "--section", "sensor"], "--quarter has its own list of measurements; leave --section out"),
     ],
 )
 def test_wrong_arguments_are_refused_before_anything_is_written(bench, capsys, words, message):
@@ -134,6 +135,81 @@ def test_wrong_arguments_are_refused_before_anything_is_written(bench, capsys, w
     assert ended.value.code == 2
     assert message in told(capsys)
     assert not bench.out.exists()
+
+
+def of_a_quarter(act: object = 0) -> dict[str, object]:
+    """The same act for all measurements of a quarter of an hour."""
+    from job import QUARTER
+
+    return {f"{section}.{name}": act for section, name, _ in QUARTER}
+
+
+def test_a_quarter_of_an_hour_goes_in_order_of_worth(bench, capsys):
+    bench.acts(**of_a_quarter())
+    assert bench("--quarter") == 0
+    assert bench.made() == list(of_a_quarter())
+    assert json.loads((bench.out / "doctor/machine.json").read_text())["minutes"] == 13
+    assert "14 of 14 measured, 0 failed, 0 not possible here, 0 to do" in capsys.readouterr().out
+    assert bench("--quarter") == 0
+    assert bench.made() == []
+
+
+def test_what_takes_too_long_in_a_quarter_takes_nothing_from_the_rest(bench, monkeypatch, capsys):
+    """It is measured again by the same command; a run that is not finished does not end the quarter."""
+    import pieces
+
+    bench.acts(**of_a_quarter() | {"sensor.torch-cuda": 60, "equal.merge": "fail", "learn.quiver-s": "long"})
+    short = [(section, name, 1.0 if section == "sensor" else most) for section, name, most in pieces.QUARTER]
+    monkeypatch.setattr(pieces, "QUARTER", short)
+    assert bench("--quarter") == 1
+    assert bench.made() == list(of_a_quarter())
+    said = capsys.readouterr().out
+    assert "sensor: torch-cuda ... open" in said
+    assert "11 of 14 measured, 1 failed, 0 not possible here, 2 to do by the same command" in said
+    bench.acts(**of_a_quarter())
+    assert bench("--quarter") == 1
+    assert bench.made() == ["sensor.torch-cuda", "learn.quiver-s"]
+
+
+def test_a_quarter_measures_what_the_sections_name(bench):
+    """At the sizes that are the default."""
+    import importlib
+
+    from job import QUARTER
+    from sizes import Sizes
+
+    named = {section: importlib.import_module(section).names(Sizes()) for section, _, _ in QUARTER}
+    by_gpu = {"batches-21-bfloat16"}  # a precision that a CPU is not asked for
+    assert all(name in named[section] or name in by_gpu for section, name, _ in QUARTER)
+
+
+def test_weights_travel_in_small_parts(bench, tmp_path, monkeypatch):
+    import learn
+
+    from quiver.model import weights
+    from quiver.model.presets import build
+
+    run = tmp_path / "run"
+    run.mkdir()
+    network = build("unet-1m")
+    weights.save(network, network.config, run / "best.safetensors", {"step": "3"})
+    for name in ("history.json", "schedule.json"):
+        (run / name).write_text("{}")
+    most = (run / "best.safetensors").stat().st_size // 7
+    monkeypatch.setattr(learn, "PART", most)
+    learn.keep(run, tmp_path / "keep")
+    learn.keep(run, tmp_path / "keep")
+    parts = sorted((tmp_path / "keep").glob("quiver-s.safetensors.*"))
+    assert len(parts) == 4
+    assert all(part.stat().st_size <= most for part in parts)
+    joined = tmp_path / "joined.safetensors"
+    joined.write_bytes(b"".join(part.read_bytes() for part in parts))
+    assert joined.stat().st_size < 0.6 * (run / "best.safetensors").stat().st_size
+    found = weights.load(joined).state_dict()
+    for name, value in network.state_dict().items():
+        assert found[name].dtype == value.dtype
+        assert torch.equal(found[name], value.half().float() if value.dtype == torch.float32 else value)
+    assert weights.metadata_of(joined)["step"] == "3"
 
 
 def test_what_is_measured_is_not_measured_again(bench, capsys):
@@ -559,24 +635,48 @@ TINY = {
     "restored": 2,
     "restored_slow": 2,
     "compared_side": 16,
+    "learn_on_gpu": False,
+    "learn_frames": 12,
+    "learn_batch": 1,
+    "learn_precision": "float32",
+    "learn_steps": 4,
 }
+TINY_RECIPE = """[recipe]
+name = "tiny"
+frames = 12
+height = 32
+width = 32
+psnr = 20.0
+
+[[scenes]]
+family = "plain"
+seeds = [1, 2]
+
+[[scenes]]
+family = "plain"
+seeds = [3]
+split = "val"
+"""
 
 
 ABSENT = {  # without a GPU
-    "sensor": {"engine-cuda", "torch-cuda"},
+    "sensor": {"engine-cuda", "device-cuda", "torch-cuda"},
     "render": {"frame-cuda-fan", "validate-cuda-fan"},
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("section", ["doctor", "sensor", "render", "steps", "train", "restore"])
+@pytest.mark.parametrize("section", ["doctor", "equal", "sensor", "render", "steps", "train", "restore", "learn"])
 def test_a_section_measures_on_this_machine_at_tiny_sizes(tmp_path, monkeypatch, section):
     """Without a GPU the CPU's form of everything is made, and what needs CUDA is absent with its reason."""
     monkeypatch.syspath_prepend(str(PARTS))
     import pieces
 
+    recipe = tmp_path / "tiny.toml"
+    recipe.write_text(TINY_RECIPE)
+    sizes = TINY | {"learn_recipe": str(recipe)}
     out = tmp_path / "out"
-    code = pieces.main([str(out), "--section", section, "--minutes", "60"], sizes=TINY)
+    code = pieces.main([str(out), "--section", section, "--minutes", "60"], sizes=sizes)
     records = json.loads((out / "table.json").read_text())["records"][section]
     told = {
         n: (r["why"], (out / "log" / f"{section}.{n}.txt").read_text(errors="replace")[-1500:])
@@ -610,7 +710,7 @@ def _sensor(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
             assert row.get("differing per million") in (None, 0), (name, row)
             assert row.get("Gpixel/s", 1) > 0
     assert {row["by"] for found in rows.values() for row in found} >= {"numpy", "llvm", "torch, cpu"}
-    assert rows["engine-llvm"][4]["all checks"] == "passed"
+    assert rows["engine-llvm"][-1]["all checks"] == "passed"
     numpy = rows["engine-llvm"][0]["Gpixel/s"]
     torchs = rows["torch-cpu"][0]["Gpixel/s"]
     assert 0.01 < numpy / torchs < 100  # one unit: both draw one number of Poisson per pixel
@@ -674,8 +774,25 @@ def _restore(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
     assert errors["quiver-s"][1] > 1e-3
 
 
+def _equal(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
+    assert set(rows) == {"codes", "merge", "classical", "windows", "network"}
+    for row in (row for part in rows.values() for row in part):
+        (largest,) = (value for name, value in row.items() if name.startswith("largest difference"))
+        assert isinstance(largest, float)
+        assert largest < 0.1, row
+
+
+def _learn(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
+    assert rows["quiver-s"][0]["steps"] == "4 of 4"
+    assert sorted(path.name for path in (out / "keep").iterdir()) == [
+        *("history.json", "quiver-s.safetensors.00", "quiver-s.safetensors.01", "schedule.json")
+    ]
+
+
 CHECKS = {
     "doctor": _doctor,
+    "equal": _equal,
+    "learn": _learn,
     "sensor": _sensor,
     "render": _render,
     "steps": _steps,

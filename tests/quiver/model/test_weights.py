@@ -254,11 +254,25 @@ def test_tensors_of_another_kind(tiny, tmp_path):
     path = tmp_path / "w.safetensors"
     notes = {"format": "quiver-1", "network": "QUIVER", "config": json.dumps(TINY.to_dict())}
     name = "cell.image1.weight"
-    for value in (tiny[name].half(), tiny[name].long(), tiny[name].flatten(), torch.ones(()), torch.ones(0)):
+    for value in (tiny[name].double(), tiny[name].long(), tiny[name].flatten(), torch.ones(()), torch.ones(0)):
         save_file(tiny | {name: value.contiguous()}, path, notes)
         assert refused_or_loaded(path)
     save_file({key: value for key, value in tiny.items() if key != name}, path, notes)
     assert refused_or_loaded(path)
+
+
+def test_a_halved_file_is_read_as_float32(tmp_path):
+    network = build("unet-1m")
+    path = tmp_path / "small.safetensors"
+    weights.save(network, network.config, tmp_path / "full.safetensors", {"step": "3"})
+    path.write_bytes(weights.halved(tmp_path / "full.safetensors"))
+    assert path.stat().st_size < 0.6 * (tmp_path / "full.safetensors").stat().st_size
+    found = weights.load(path).state_dict()
+    for name, value in network.state_dict().items():
+        expected = value.half().float() if value.dtype == torch.float32 else value
+        assert found[name].dtype == value.dtype
+        assert torch.equal(found[name], expected)
+    assert weights.metadata_of(path)["step"] == "3"
 
 
 def test_files_of_ours_still_load(tmp_path):
