@@ -138,11 +138,11 @@ def _settings(job: Job, network: str, precision: str) -> Any:
     given = {"steps": sizes.steps, "validate_every": sizes.steps, "validation_windows": 4, "precision": precision}
     given |= {name: value for name, value in (("crop", sizes.crop), ("batch", sizes.batch)) if value is not None}
     folders = {"data": str(job.out / "data"), "out": str(job.out / "runs" / job.name), "network": network}
-    return Settings(**dict(defaults) | folders | given | {"workers": _workers(sizes)})
+    return Settings(**dict(defaults) | folders | given)
 
 
 def _workers(sizes: Sizes) -> int:
-    """Return how many processes draw windows: where the GPU computes, the cores are free for them."""
+    """Return how many processes draw the batches that are copied: where the GPU computes, cores are free for them."""
     import torch
 
     return min(sizes.workers, len(os.sched_getaffinity(0)) - 1) if torch.cuda.is_available() else 0
@@ -200,6 +200,7 @@ def _copies(job: Job) -> list[dict[str, Any]]:
     from quiver.training.settings import settled
 
     settings, _ = settled(_settings(job, COPIED, "bfloat16"))
+    workers = _workers(job.sizes)
     threads.use()
     place = torch.device(pick_device("auto"))
     model = build(COPIED).to(place).train()
@@ -211,8 +212,8 @@ def _copies(job: Job) -> list[dict[str, Any]]:
             windows,
             batch_sampler=Batches(settings.batch, 0, job.sizes.copied_batches),
             pin_memory=pinned,
-            num_workers=settings.workers,
-            multiprocessing_context="spawn" if settings.workers else None,
+            num_workers=workers,
+            multiprocessing_context="spawn" if workers else None,
         )
         ends = []
         for batch in loader if copied else [held] * job.sizes.copied_batches:
@@ -238,7 +239,7 @@ def _copies(job: Job) -> list[dict[str, Any]]:
         {
             "copies of batches": name,
             "device": place.type,
-            "workers": settings.workers,
+            "workers": workers,
             "batches per s": 1 / seconds(*way),
         }
         for name, way in ways
