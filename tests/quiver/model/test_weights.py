@@ -22,10 +22,10 @@ from torch import nn
 
 from qsim.process import peak_memory, reset_peak
 from quiver.model.config import Config
-from quiver.model.presets import PRESETS
+from quiver.model.presets import PRESETS, build
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
-from quiver.model.weights import annotate, digest, load, save
+from quiver.model.weights import annotate, digest, halved, load, save
 from quiver.restoration.restorers import weights_path
 
 
@@ -264,15 +264,15 @@ def test_tensors_of_another_kind(tiny, tmp_path):
 def test_a_halved_file_is_read_as_float32(tmp_path):
     network = build("unet-1m")
     path = tmp_path / "small.safetensors"
-    weights.save(network, network.config, tmp_path / "full.safetensors", {"step": "3"})
-    path.write_bytes(weights.halved(tmp_path / "full.safetensors"))
+    save(network, network.config, tmp_path / "full.safetensors", {"step": "3"})
+    path.write_bytes(halved(tmp_path / "full.safetensors"))
     assert path.stat().st_size < 0.6 * (tmp_path / "full.safetensors").stat().st_size
-    found = weights.load(path).state_dict()
+    found = load(path).state_dict()
     for name, value in network.state_dict().items():
         expected = value.half().float() if value.dtype == torch.float32 else value
         assert found[name].dtype == value.dtype
         assert torch.equal(found[name], expected)
-    assert weights.metadata_of(path)["step"] == "3"
+    assert notes(path)["step"] == "3"
 
 
 def test_files_of_ours_still_load(tmp_path):
