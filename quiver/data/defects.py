@@ -60,7 +60,7 @@ class Filler:
         """Return codes [T, H, W] with the defective pixels filled; frames are numbered from `first`."""
         flat = codes.reshape(len(codes), -1)
         near = flat[:, self.sources]  # [T, n, k]
-        chance = keys.uniform(keys.words(Key(0, 0, first, STAGE), codes.shape))[:, self.bad]
+        chance = keys.uniform(self._words(len(codes), first))
         filled = codes.copy()
         if self.picks:
             chosen = (chance[..., None] > self.weights.cumsum(axis=1)[:, :-1]).sum(axis=-1, keepdims=True)
@@ -69,6 +69,13 @@ class Filler:
             means = np.einsum("tnk,nk->tn", near.astype(float), self.weights)
             filled[:, self.bad] = np.floor(means + chance).astype(codes.dtype)
         return filled
+
+    def _words(self, frames: int, first: int) -> Array:
+        """Return the random words of the defective pixels of some frames, uint32 [T, n]: of these pixels alone."""
+        y, x = np.nonzero(self.bad)
+        t = np.repeat(np.arange(first, first + frames), len(y))
+        at = np.stack([t, np.tile(y, frames), np.tile(x, frames)])
+        return keys.words_at(Key(0, 0, 0, STAGE), at).reshape(frames, -1)
 
 
 def skips_codes(sensor: Sensor) -> bool:

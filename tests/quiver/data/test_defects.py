@@ -11,7 +11,7 @@ from clips import ClipMaker
 from sensor_files import COUNTER, QIS, SPAD, sensor_file
 from stats import assert_mean
 
-from qsim.keys import Key
+from qsim.keys import Key, words
 from qsim.sensor import qis
 from qsim.sensor.defects.fixed_pattern import FixedPattern, draw_maps
 from qsim.sensor.spad import BinarySPAD
@@ -19,7 +19,7 @@ from qsim.streams.sensing import Sensing
 from qsim.streams.storing import sense
 from quiver.baselines import METHODS
 from quiver.data.codes import array_codes, filled, light_of, sensed, stream_codes
-from quiver.data.defects import Filler, read_map, skips_codes
+from quiver.data.defects import STAGE, Filler, read_map, skips_codes
 from quiver.data.illumination import Illumination
 from quiver.data.windows import Windows, WindowSettings
 from quiver.restoration.restorers import restorer
@@ -92,6 +92,13 @@ def test_a_slope_goes_on_through_a_single_pixel():
     bad = np.zeros((9, 9), bool)
     bad[4, 4] = True
     np.testing.assert_array_equal(Filler(bad).fill(slope, 0), slope)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.6])
+def test_the_chance_of_a_pixel_is_that_of_the_complete_frame(share):
+    bad = np.random.default_rng(3).random((13, 22)) < share
+    expected = words(Key(0, 0, 7, STAGE), (4, 13, 22))[:, bad]
+    np.testing.assert_array_equal(Filler(bad)._words(4, 7), expected)
 
 
 def test_frames_are_filled_alike_in_any_blocks():
