@@ -70,6 +70,11 @@ def is_gpu(device: torch.device) -> bool:
     return device.type == "cuda"
 
 
+def is_host(device: torch.device) -> bool:
+    """Return whether the device is the host's own processor, which can be asked for numbers at no cost."""
+    return device.type == "cpu"
+
+
 def moved(tensor: Tensor, device: torch.device) -> Tensor:
     """Return the tensor on the device; the copy of a pinned one does not wait for the GPU."""
     return tensor.to(device, non_blocking=tensor.is_pinned())

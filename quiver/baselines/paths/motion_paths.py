@@ -29,7 +29,15 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from quiver.baselines.paths.camera_motion import camera_motion, field, parted, seen_without, slope
+from quiver.baselines.paths.camera_motion import (
+    camera_motion,
+    field,
+    lattice,
+    parted,
+    seen_with_noise,
+    seen_without,
+    slope,
+)
 from quiver.baselines.paths.moved_frames import (
     SCALES,
     Path,
@@ -41,6 +49,7 @@ from quiver.baselines.paths.moved_frames import (
     smooth_mean,
 )
 from quiver.baselines.paths.path_search import misfit, misfits_of, neighbours, search
+from quiver.device import is_host
 
 SPEED = 18.0  # px/frame, the fastest that is tried; refinement goes slightly beyond
 SLOW = 3.0  # px/frame, the fastest that is tried at scale 4
@@ -77,19 +86,28 @@ def moves(pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, dev
     fine = SCALES[-1]
     camera = camera_motion(pyramid, offsets)
     smooth, shake = parted(camera, offsets)
-    nothing = (torch.zeros_like(codes[:, :1].expand(-1, 2, -1, -1)),) * 2
     unit = (fine / deviation)[:, None]
     rest = _spread(look_still(codes), None, None, unit)
-    steady, whole = (
-        _spread(*look_with_noise(codes, nothing, offsets, fine, motion), unit) for motion in (camera - shake, camera)
-    )
     mean = seen_without(pyramid[fine], camera, fine)[0].mean(1)
+    whole = _spread(*seen_with_noise(codes, camera, fine), unit)
     pans = agrees(rest - whole, told(mean, camera))
+    if none_of(pans):
+        return Moves(paths(pyramid, offsets, codes, deviation, still=rest), torch.zeros_like(shake))
+    steady = _spread(*seen_with_noise(codes, camera - shake, fine), unit)
     shakes = (pans & agrees(steady - whole, told(mean, shake)))[:, None, None, None]
+    smooth = torch.where(pans[:, None, None, None], smooth, 0.0)
+    if none_of(shakes):
+        still = torch.where(pans[:, None, None], steady, rest)
+        return Moves(paths(pyramid, offsets, codes, deviation, smooth, still), torch.zeros_like(shake))
     shake = torch.where(shakes, shake, 0.0)
     without = {scale: torch.where(shakes, seen_without(x, shake, scale)[0], x) for scale, x in pyramid.items()}
     codes = torch.where(shakes, seen_without(codes, shake, fine)[0], codes)
-    return Moves(paths(without, offsets, codes, deviation, torch.where(pans[:, None, None, None], smooth, 0.0)), shake)
+    return Moves(paths(without, offsets, codes, deviation, smooth), shake)
+
+
+def none_of(found: Tensor) -> bool:
+    """Return whether nothing was found, so that what follows from it need not be computed; a GPU is not asked."""
+    return is_host(found.device) and not found.numpy().any()
 
 
 def told(mean: Tensor, camera: Tensor) -> Tensor:
@@ -98,8 +116,13 @@ def told(mean: Tensor, camera: Tensor) -> Tensor:
     It is the square of what the motion changes there, in variances of the noise: what a cell gains if the motion is
     true, and loses if it is not.
     """
-    changes = (slope(mean)[:, None] * field(camera, *mean.shape[-2:])).sum(2)
-    return changes.square_().sum(1)  # of cells / scale px over 1 / scale of noise
+    places = lattice(*mean.shape[-2:], mean.device)
+    pull = (slope(mean)[:, :, None] * places).flatten(1, 2)  # [B, 6, h, w], changes by each number of a motion
+    numbers = camera.flatten(2)
+    # The sum over frames of (numbers . pull)^2 is a quadratic form of pull: frames need not be seen one by one.
+    form = numbers.mT @ numbers
+    both = (form @ pull.flatten(2)).view_as(pull)
+    return both.mul_(pull).sum(1).clamp_(min=0)  # of cells / scale px over 1 / scale of noise
 
 
 def agrees(gain: Tensor, told: Tensor) -> Tensor:
@@ -123,6 +146,7 @@ def paths(
     codes: Tensor,
     deviation: Tensor,
     smooth: Tensor | None = None,
+    still: Tensor | None = None,
 ) -> Path:
     """Return velocity and acceleration [B, 2, H, W] of frames at each scale: {scale: [B, K, H/scale, W/scale]}.
 
@@ -130,6 +154,7 @@ def paths(
     1 / scale, as phi of pooled codes nearly has. Mean `codes` [B, K, H/2, W/2] of scale 2 and the `deviation`
     [B, H/2, W/2] of one code tell what moves: of four codes of one bit, phi has up to 1.8 times that variance. A path
     must fit better than no motion, or than the `smooth` motion of the camera, velocity and acceleration [B, 2, 2, 3].
+    The misfits [B, h, w] of that motion may be known: `still`, as `_spread` returns them.
     """
     coarse, middle, fine = (pyramid[scale] for scale in SCALES)
     shape = middle.shape[-2:]
@@ -140,7 +165,7 @@ def paths(
     velocity, acceleration = corrected(fine, offsets, _better(fine, offsets, found), *REFINE[1])
     found = (velocity, acceleration)
     base = None if smooth is None else field(smooth, *codes.shape[-2:])
-    taken = moving(codes, deviation, offsets, found, base)
+    taken = moving(codes, deviation, offsets, found, base, still)
     full = [SCALES[-1] * side for side in codes.shape[-2:]]
     taken = functional.interpolate(taken[:, None].to(velocity.dtype), size=full)
     if smooth is None:
@@ -171,20 +196,29 @@ def corrected(frames: Tensor, offsets: Sequence[int], path: Path, scale: int, ra
     return path
 
 
-def moving(codes: Tensor, deviation: Tensor, offsets: Sequence[int], path: Path, base: Tensor | None = None) -> Tensor:
+def moving(
+    codes: Tensor,
+    deviation: Tensor,
+    offsets: Sequence[int],
+    path: Path,
+    base: Tensor | None = None,
+    still: Tensor | None = None,
+) -> Tensor:
     """Return where paths at scale 2 fit the codes (see `paths`) better than no motion does, beyond what noise explains:
     bool [B, h, w]. A `base` [B, 2, 2, h, w], velocity and acceleration, stands for no motion; where it moves, paths
-    lose no sharpness against it, and must only fit better than by the numbers that they have free.
+    lose no sharpness against it, and must only fit better than by the numbers that they have free. Its misfits are
+    `still` if they are known.
     """
     radius, margin = STILL
     unit = (SCALES[-1] / deviation)[:, None]
     least: Tensor | float = margin
-    if base is None:
-        still = _spread(look_still(codes), None, None, unit)
-    else:
-        still = _spread(*look_with_noise(codes, (base[:, 0], base[:, 1]), offsets, SCALES[-1]), unit)
+    if base is not None:
         least = torch.where(base.abs().amax((1, 2)) > 0, PAN, margin)
-    gain = still.sub_(_spread(*look_with_noise(codes, path, offsets, SCALES[-1]), unit))
+    if still is None and base is not None:
+        still = _spread(*look_with_noise(codes, (base[:, 0], base[:, 1]), offsets, SCALES[-1]), unit)
+    elif still is None:
+        still = _spread(look_still(codes), None, None, unit)
+    gain = still.sub(_spread(*look_with_noise(codes, path, offsets, SCALES[-1]), unit))
     return box_mean(gain, radius) * (2 * radius + 1) ** 2 > least
 
 
