@@ -34,10 +34,10 @@ def measure(job: Job) -> list[dict[str, Any]]:
     """Return one row of the run; a run that is not finished resumes in the next piece."""
     import torch
 
+    from quiver.data.rendering import Rendering
     from quiver.device import PeakMemory, pick_device
     from quiver.model.presets import build
     from quiver.training.loop import train
-    from quiver.training.rendering import Rendering
 
     sizes = job.sizes
     kind = pick_device("auto")

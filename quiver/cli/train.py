@@ -27,7 +27,7 @@ from quiver.restoration.interface import RestoreOptions
 from quiver.training.settings import PROTOCOLS, Settings
 
 if TYPE_CHECKING:
-    from quiver.training.rendering import Rendering
+    from quiver.data.rendering import Rendering
     from quiver.training.schedule import State
 
 DIVERGED = 3  # exit code of a run whose loss became NaN or infinite
@@ -70,7 +70,7 @@ def train(asked: Train, given: Annotated[dict[str, Any], Settings]) -> int:
 
 def _rendering(given: Mapping[str, Any], should_stop: Callable[[], bool]) -> Rendering | None:
     """Return the data set to render meanwhile, if the data is a recipe; `ValueError` where that cannot be."""
-    from quiver.training.rendering import Rendering, folder_of, is_recipe
+    from quiver.data.rendering import Rendering, folder_of, is_recipe
 
     data = given["data"]
     sources = (data,) if isinstance(data, str) else data

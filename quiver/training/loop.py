@@ -36,6 +36,7 @@ from quiver.data.device_light import Unfit
 from quiver.data.device_windows import DeviceWindows
 from quiver.data.growing import GrowingWindows
 from quiver.data.illumination import OTHERS
+from quiver.data.rendering import Rendering
 from quiver.data.stream_windows import StreamWindows
 from quiver.data.windows import Batches, Windows, WindowSettings
 from quiver.device import Reading, is_gpu, light_memory, moved, steps_ahead
@@ -47,7 +48,6 @@ from quiver.training.ahead import Copy, Pending
 from quiver.training.compiling import Compiled, why_not
 from quiver.training.optimiser import Optimiser
 from quiver.training.processes import Process, begin_worker, joined, plain_errors
-from quiver.training.rendering import Rendering
 from quiver.training.run_folder import SCHEDULE, Run
 from quiver.training.saving import CHECKPOINT_SECONDS, first_line
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due

@@ -6,7 +6,7 @@ import sys
 import fakes
 
 from qsim.dataset import generation
-from quiver.training.rendering import main
+from quiver.data.rendering import main
 
 if __name__ == "__main__":
     generation.generate = functools.partial(generation.generate, make=getattr(fakes, sys.argv[1]))

@@ -70,7 +70,7 @@ def whole_packets(numbers: Array) -> Array:
 
 
 def aligned(shape: tuple[int, ...], kind: Any) -> Array:
-    """Return an empty array whose memory begins where Dr.Jit's own would.
+    """Return an empty array [...] of a shape, whose memory begins where Dr.Jit's own would.
 
     Kernels for other memory are other kernels: without this one would be compiled again by chance.
     """
@@ -89,7 +89,7 @@ def is_aligned(numbers: Any) -> bool:
 
 
 def in_aligned(numbers: Array) -> Array:
-    """Return the same numbers in memory as of `aligned`; without a copy where they are there."""
+    """Return the same numbers [...] in memory as of `aligned`; without a copy where they are there."""
     if is_aligned(numbers) and numbers.flags.c_contiguous:
         return numbers
     found = aligned(numbers.shape, numbers.dtype)

@@ -15,8 +15,9 @@ from safetensors.torch import load_file
 from qsim.dataset import recipe
 from qsim.dataset.generation import Options, generate
 from quiver.cli.program import main
-from quiver.training import loop, rendering
-from quiver.training.rendering import mixed
+from quiver.data import rendering
+from quiver.data.rendering import mixed
+from quiver.training import loop
 
 TEXT = """[recipe]
 name = "small"
@@ -143,7 +144,7 @@ def test_a_validation_clip_that_cannot_be_rendered_ends_the_run(source, tmp_path
     assert train(source, tmp_path / "run", "--steps", 2, "-q") == 2
     last = capfd.readouterr().err.splitlines()[-1]
     assert "0 of 1 clips of split 'val' could be rendered" in last
-    assert "--retry` says why" in last
+    assert "small.toml says why" in last
 
 
 def test_a_folder_of_another_recipe_is_not_trained_on(source, tmp_path, capfd):

@@ -30,7 +30,7 @@ from qsim.dataset.job import Job
 from qsim.dataset.jobs import Jobs
 from quiver.data.growing import Schedule, planned
 
-RENDERER = (sys.executable, "-m", "quiver.training.rendering")
+RENDERER = (sys.executable, "-m", "quiver.data.rendering")
 PAUSE = 0.5  # s, between looks at what is finished
 TRAIN = "train"
 
@@ -107,7 +107,7 @@ class Rendering:
             if ended:
                 raise ValueError(
                     f"{self.folder}: {done} of {count} clips of split '{split}' could be rendered that the run waits "
-                    f"for; `qsim generate {self.source} -o {self.folder} --retry` says why"
+                    f"for; `qsim generate` of {self.source} says why"
                 )
             if self.should_stop():
                 raise KeyboardInterrupt
