@@ -39,10 +39,26 @@ class Errors:
     @classmethod
     def of_halves(cls, halves: Array, white: float) -> Errors:
         """Return the errors of the mean of two independent halves [2, ...] that have noise only."""
-        picture = halves.mean(axis=0)
-        squares = (halves[0] - halves[1]) ** 2 / 4
-        clamped = clamped_squares(squares, picture, halves.min(axis=0), white)
-        return cls(math.sqrt(float(clamped.mean())), math.sqrt(float(squares.mean())))
+        noise = HalvesNoise.of(halves)
+        return cls(noise.error_at(white), math.sqrt(float(noise.squares.mean())))
+
+
+@dataclass(frozen=True, eq=False)
+class HalvesNoise:
+    """What the errors of the mean of two independent halves need at any white; they have noise only."""
+
+    picture: Array  # [...], the mean
+    squares: Array  # [...], squared errors
+    lower: Array  # [...], the darker half
+
+    @classmethod
+    def of(cls, halves: Array) -> HalvesNoise:
+        """Return the noise of halves [2, ...]."""
+        return cls(halves.mean(axis=0), (halves[0] - halves[1]) ** 2 / 4, halves.min(axis=0))
+
+    def error_at(self, white: float) -> float:
+        """Return the rms error of picture and truth clamped at white."""
+        return math.sqrt(float(clamped_squares(self.squares, self.picture, self.lower, white).mean()))
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,17 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 
 from qsim import files, records
 from qsim.clip.clip_info import PHYSICAL, ClipInfo, FlickerInfo, Matrix, Origin, RenderInfo, SceneName
 from qsim.clip.writer import ClipWriter
 from qsim.host import own_numbers
 from qsim.lazy_array import Crop
+from qsim.rendering.behind import Behind
 from qsim.rendering.budget import Budget
 from qsim.rendering.engine import free_memory
-from qsim.rendering.renderer import Renderer
+from qsim.rendering.renderer import Frame, Renderer
 from qsim.scene import Scene
 from qsim.streams.clip import Clip
 
@@ -67,14 +69,24 @@ def render_clip(  # noqa: PLR0913 (settings of a public function)
         seed=seed,
         render=RenderInfo(**vars(renderer.budget), engine=renderer.engine.backend, variant=renderer.engine.variant),
     )
-    with ClipWriter(path, info, force=force) as writer:
+
+    def store(t: int, finished: Callable[[], Frame]) -> None:
+        frame = finished()
+        stated = (frame.error, frame.fireflies, frame.errors_at)
+        writer.add(t, frame.radiance, frame.sharp, frame.truth, *stated, code=frame.code)
+
+    tell = progress or (lambda done, frames: None)
+    with ClipWriter(path, info, force=force) as writer, Behind() as behind:
         for t in range(frames):
-            if not writer.has(t):
-                frame = renderer.frame(t)
-                stated = (frame.error, frame.fireflies, frame.errors_at)
-                writer.add(t, frame.radiance, frame.sharp, frame.truth, *stated, code=frame.code)
-            if progress is not None:
-                progress(t + 1, frames)
+            finished = None if writer.has(t) else renderer.begun(t)
+            if behind.wait():
+                tell(t, frames)
+            if finished is None:
+                tell(t + 1, frames)
+            else:
+                behind.start(partial(store, t, finished))
+        if behind.wait():
+            tell(frames, frames)
     return Clip.open(path)
 
 

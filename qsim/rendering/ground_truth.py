@@ -19,6 +19,7 @@ import math
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.optics.camera import Camera
 from qsim.rendering.ray_casting import Hits
 from qsim.scene import Body, Scene
 
@@ -41,7 +42,18 @@ def flow_between(scene: Scene, rays: Array, hits: Hits, t: float, later: float) 
     """
     before = scene.camera.at(t)
     camera = scene.camera.at(later)
-    start, end = seen_again(scene, rays, hits, t, later)
+    start, end, moved = seen_again(scene, rays, hits, t, later)
+    if moved is not None and before is camera:
+        # Points at rest stay inside the frame, and their flow is exactly 0.
+        flow = np.zeros((2, rays.shape[1]))
+        inside = np.ones(rays.shape[1], bool)
+        flow[:, moved], inside[moved] = _flow(before, camera, start[:, moved], end[:, moved])
+        return flow, inside, end
+    return *_flow(before, camera, start, end), end
+
+
+def _flow(before: Camera, camera: Camera, start: Array, end: Array) -> tuple[Array, Array]:
+    """Return flow [2, N] and whether it ends inside the frame [N], from rays [3, N] of two cameras to one point."""
     ahead = end[2] > 0
     place = camera.seen(end[:2] / np.where(ahead, end[2], 1.0))
     inside = ahead
@@ -50,13 +62,12 @@ def flow_between(scene: Scene, rays: Array, hits: Hits, t: float, later: float) 
         inside = inside & (along >= -low) & (along <= high)
     # Of a resting lens both ends have one scale, and a point at rest has a flow of exactly 0.
     if before is camera:
-        flow = np.where(ahead, place - camera.seen(start[:2] / start[2]), 0.0) * camera.focal_pixels
-        return flow, inside, end
+        return np.where(ahead, place - camera.seen(start[:2] / start[2]), 0.0) * camera.focal_pixels, inside
     ends = [
         view.seen(slopes) * view.focal_pixels + np.array(view.axis)[:, None]
         for view, slopes in ((before, start[:2] / start[2]), (camera, end[:2] / np.where(ahead, end[2], 1.0)))
     ]
-    return np.where(ahead, ends[1] - ends[0], 0.0), inside, end
+    return np.where(ahead, ends[1] - ends[0], 0.0), inside
 
 
 def motion_extent(scene: Scene, rays: Array, hits: Hits, t: float, exposure: float, *, sharp: bool) -> Array:
@@ -76,21 +87,23 @@ def motion_extent(scene: Scene, rays: Array, hits: Hits, t: float, exposure: flo
     return np.minimum(fastest * SPEED_STEPS, across)
 
 
-def seen_again(scene: Scene, rays: Array, hits: Hits, t: float, later: float) -> tuple[Array, Array]:
-    """Return the rays [3, N] of the hits at time t, and of the same points at time `later`.
+def seen_again(scene: Scene, rays: Array, hits: Hits, t: float, later: float) -> tuple[Array, Array, Array | None]:
+    """Return the rays [3, N] of the hits at time t, of the same points at time `later`, and the points that moved.
 
     The first result differs from `rays` only for deforming bodies: their points are rebuilt from their triangles, with
-    the same rounding at both times.
+    the same rounding at both times. Points that moved are sorted indices [n]; None where the camera moved.
     """
     before = scene.camera.pose(t)
     after = scene.camera.pose(later)
     inverse = 1 / hits.distance
     start = rays
     end = _moved(rays, inverse, before, np.eye(4), after)
+    moved = []
     for number in np.flatnonzero(np.bincount(hits.number + 1)[1:]).tolist():
         body = scene.bodies[number] if number < len(scene.bodies) else None
         if body is not None and body.deforms:
             chosen = np.flatnonzero(hits.number == number)
+            moved.append(chosen)
             start = start.copy() if start is rays else start
             for ends, moment, view in ((start, t, before), (end, later, after)):
                 points = _points(body, hits, chosen, moment) - view[:3, 3]
@@ -100,9 +113,12 @@ def seen_again(scene: Scene, rays: Array, hits: Hits, t: float, later: float) ->
         there = body_pose(scene, number, later)
         if not np.array_equal(here, there):
             chosen = np.flatnonzero(hits.number == number)
+            moved.append(chosen)
             motion = there @ np.linalg.inv(here)
             end[:, chosen] = _moved(rays[:, chosen], inverse[chosen], before, motion, after)
-    return start, end
+    if not np.array_equal(before, after):
+        return start, end, None
+    return start, end, np.sort(np.concatenate(moved)) if moved else np.zeros(0, np.int64)
 
 
 def visible(distance: Array, hits: Hits) -> Array:

@@ -6,6 +6,7 @@ A ray passes through a surface where that lets more than half of the light strai
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -30,11 +31,14 @@ class Hits:
     weights: Array  # float64 [N, 2], barycentric weights of the triangle's second and third vertex
 
 
+@lru_cache(maxsize=2)
 def pixel_rays(camera: Camera, crop: tuple[int, int, int, int], thinned: int = 1) -> Array:
-    """Return rays [3, N] through a window's pixel centres, row by row, in the camera's axes with z = 1."""
+    """Return rays [3, N] through a window's pixel centres, row by row, in the camera's axes with z = 1; read-only."""
     y, x, height, width = crop
     rays = camera.directions()[y : y + height : thinned, x : x + width : thinned]
-    return np.ascontiguousarray(rays.reshape(-1, 3).T)
+    found = np.ascontiguousarray(rays.reshape(-1, 3).T)
+    found.setflags(write=False)
+    return found
 
 
 class RayCaster:

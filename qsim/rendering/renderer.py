@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -22,7 +24,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.backend import RenderEngine
-from qsim.clip.clamped_error import Errors, StatedError, error_at, frame_errors, rms, white_in
+from qsim.clip.clamped_error import HalvesNoise, StatedError, error_at, frame_errors, rms, white_in
 from qsim.device_lock import one_thread_at_a_time
 from qsim.host import own_numbers
 from qsim.keys import Key, hash_name, words
@@ -31,11 +33,11 @@ from qsim.optics.radiometry import check_crop
 from qsim.rendering import ground_truth
 from qsim.rendering.budget import Budget, as_bright, blur_left, grid_samples, instants, light_windows
 from qsim.rendering.camera_rays import CameraRays, Film
-from qsim.rendering.denoiser import cleaned_mean
+from qsim.rendering.denoiser import Mixture, cleaned_mean
 from qsim.rendering.engine import activate, in_colour, in_own_variant, select
 from qsim.rendering.mitsuba_scene import Stage, film_pass
 from qsim.rendering.planes import Planes, together
-from qsim.rendering.ray_casting import RayCaster, pixel_rays
+from qsim.rendering.ray_casting import Hits, RayCaster, pixel_rays
 from qsim.rendering.reuse.carrying import Carrier, unshared
 from qsim.rendering.reuse.choice import best_of, reused_mean
 from qsim.scene import Scene
@@ -70,6 +72,15 @@ class Frame:
         """The ground truth by name, as a clip stores it."""
         names = ("flow", "flow_back", "valid", "depth", "body_id")
         return {name: value for name in names if (value := getattr(self, name)) is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What is seen through the pixel centres of a frame, and where it is in the next frame and in the one before."""
+
+    hits: Hits
+    forth: Future[tuple[Array, Array, Array]]  # as of `ground_truth.flow_between`
+    back: Callable[[], tuple[Array, Array, Array]]
 
 
 @own_numbers
@@ -176,22 +187,39 @@ class Renderer:
         half = self.exposure / 2
         return {name: flicker.mean(middle - half, middle + half) for name, flicker in self.scene.flickers.items()}
 
-    @in_own_variant
     def frame(self, t: int, *, with_truth: bool = True) -> Frame:
         """Render frame t: arrays of the window's height and width [H, W]."""
+        return self.begun(t, with_truth=with_truth)()
+
+    @in_own_variant
+    def begun(self, t: int, *, with_truth: bool = True) -> Callable[[], Frame]:
+        """Do the part of frame t that needs the engine; the result does the rest once, in any thread.
+
+        So the engine can render the next frame meanwhile.
+        """
         if self.budget.planes > 1:
-            return self._plane(t, with_truth)
+            plane = self._plane(t, with_truth)
+            return lambda: plane
+        # Of an instant the truth's rays go first, so that the host follows their points while paths are traced.
+        early = self._seen(t) if with_truth and self.shutter == 0 and not self._whole else None
         exposed = self._shared(t, self._whole) if self._whole else self._exposed(self.instants(t), self.key(t))
-        radiance, error, errors_at, fireflies = exposed
-        sharp = None
+        of_sharp = None
         if self.shutter > 0 and self.budget.sharp:  # the truth of scores: the larger error of both is stated
-            sharp, other, others_at, more = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))
-            error = max(error, other)
-            fireflies = fireflies + more
-            errors_at = tuple((white, max(at, error_at(white, others_at or errors_at))) for white, at in errors_at)
+            of_sharp = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))
         # Last: it leaves the scene at t + 1, where the next frame starts.
-        truth: dict[str, Any] = self.truth(t) if with_truth else {}
-        return Frame(radiance, error, errors_at, fireflies, sharp, **truth)
+        truth: Callable[[], dict[str, Any]] = self._truth(t, early or self._seen(t)) if with_truth else dict
+
+        def finished() -> Frame:
+            radiance, error, errors_at, fireflies = exposed()
+            sharp = None
+            if of_sharp is not None:
+                sharp, other, others_at, more = of_sharp()
+                error = max(error, other)
+                fireflies = fireflies + more
+                errors_at = tuple((white, max(at, error_at(white, others_at or errors_at))) for white, at in errors_at)
+            return Frame(radiance, error, errors_at, fireflies, sharp, **truth())
+
+        return finished
 
     def _plane(self, t: int, with_truth: bool) -> Frame:
         """Render a frame that shares the noise of its code with the others."""
@@ -203,7 +231,8 @@ class Renderer:
         code = None
         if t in planes.middles:
             instant = [self.time(t)]
-            found = self._finished(planes.middles[t], instant, self.key(t), self.budget.of_middles)
+            surfaces = self.surfaces(instant, self.key(t)) if self.budget.denoise else None
+            found = self._finished(planes.middles[t], surfaces, 1, self.budget.of_middles)
             sharp, plain, at_whites, fireflies = found
             of_sharp = StatedError(plain, at_whites)
             if number == self.budget.planes // 2 and len(planes.errors) == self.budget.planes:
@@ -317,15 +346,19 @@ class Renderer:
         key = partial(self.key, stage=stage)
         return Carrier(self.stage, self.film, self._caster, integrator, each, budget.neighbours, every, self.time, key)
 
-    def _shared(self, t: int, whole: Renderer) -> Exposed:
+    def _shared(self, t: int, whole: Renderer) -> Callable[[], Exposed]:
         """Return the same as `_exposed` of a frame that shares samples, cut from the complete frame."""
         pictures = self._carrier.pictures(t)
+        # The denoiser sees the complete frame, as windows of it would have other edges.
+        surfaces = whole.surfaces([self.time(t)], self.key(t)) if self.budget.denoise else None
+        return partial(self._cut, pictures, surfaces)
+
+    def _cut(self, pictures: Array, surfaces: tuple[Array, Array] | None) -> Exposed:
+        """Return radiance and errors of a frame from pictures of the complete one, which more and more frames share."""
         own = pictures[0]
         broken = ~np.isfinite(pictures[0]).all(axis=0)
         pictures[:, :, broken] = 0
         white = self.budget.white or white_in(own.mean(axis=0))
-        # The denoiser sees the complete frame, as windows of it would have other edges.
-        surfaces = whole.surfaces([self.time(t)], self.key(t)) if self.budget.denoise else None
         best, _ = best_of(pictures, white, self.budget.denoise)
         cut = reused_mean(own, best, surfaces, white, self.budget.quality).cut(self.crop, self.film.thinned)
         errors_at = frame_errors(lambda white: math.hypot(cut.error_at(white), self.budget.left_out_clamped), white)
@@ -333,12 +366,14 @@ class Renderer:
         fireflies = int(np.count_nonzero(fireflies_in(own, broken)[y : y + height, x : x + width]))
         return cut.picture.astype(np.float32), math.hypot(cut.error, self.budget.left_out), errors_at, fireflies
 
-    def _exposed(self, instants: list[float], key: Key) -> Exposed:
-        """Return the mean radiance [H, W], its rms error, that error at some whites, and the fireflies."""
-        return self._finished(self.means(instants, self.budget, key), instants, key, self.budget)
+    def _exposed(self, instants: list[float], key: Key) -> Callable[[], Exposed]:
+        """Render an exposure; the result returns radiance [H, W], its rms error, that at some whites, and fireflies."""
+        means = self.means(instants, self.budget, key)
+        surfaces = self.surfaces(instants, key) if self.budget.denoise else None
+        return partial(self._finished, means, surfaces, len(instants), self.budget)
 
-    def _finished(self, means: Array, instants: list[float], key: Key, budget: Budget) -> Exposed:
-        """Return the same from the means of `means`."""
+    def _finished(self, means: Array, surfaces: tuple[Array, Array] | None, instants: int, budget: Budget) -> Exposed:
+        """Return the same from the means of so many instants and what the denoiser needs; None: not denoised."""
         halves = means[0]
         broken = ~np.isfinite(means[0]).all(axis=0)
         means[:, :, broken] = 0  # they would break the denoiser and every mean around them
@@ -347,18 +382,19 @@ class Renderer:
         fireflies = int(np.count_nonzero(fireflies_in(halves, broken)))
         # The picture is clamped at white before it is scored, so its error there counts, beside that without a clamp.
         white = budget.white or white_in(radiance)
-        mixed = None
-        if budget.denoise:
-            mixed = cleaned_mean(halves, *self.surfaces(instants, key), white, budget.quality)
+        noise: HalvesNoise | Mixture
+        if surfaces is None:
+            noise = HalvesNoise.of(halves)
+        else:
+            noise = mixed = cleaned_mean(halves, *surfaces, white, budget.quality)
             radiance = mixed.picture
             error = mixed.error
 
         def clamped(white: float) -> float:
-            noise = mixed.error_at(white) if mixed else Errors.of_halves(halves, white).at_white
-            blur = blur_left(np.minimum(means, white), len(instants)) if len(instants) > 1 else 0.0
-            return math.hypot(noise, blur, budget.left_out_clamped)
+            blur = blur_left(np.minimum(means, white), instants) if instants > 1 else 0.0
+            return math.hypot(noise.error_at(white), blur, budget.left_out_clamped)
 
-        whole = math.hypot(error, blur_left(means, len(instants)), budget.left_out)
+        whole = math.hypot(error, blur_left(means, instants), budget.left_out)
         return radiance.astype(np.float32), whole, frame_errors(clamped, white), fireflies
 
     @in_own_variant
@@ -424,25 +460,43 @@ class Renderer:
     @in_own_variant
     def truth(self, t: int) -> dict[str, Array]:
         """Return flow, validity, depth and body of frame t at mid-exposure, as in `Frame`."""
+        return self._truth(t, self._seen(t))()
+
+    def _seen(self, t: int) -> Seen:
+        """Cast rays through the pixel centres of frame t, and follow what they hit in a thread."""
         camera = self.scene.camera
         now = self.time(t)
-        after = self.time(t + 1)
-        shape = self.shape
         rays = pixel_rays(camera.at(now), self.crop, self.film.thinned)
         self.stage.place(now)
         hits = self._caster.cast(camera.pose(now), rays)
-        flow, inside, then = ground_truth.flow_between(self.scene, rays, hits, now, after)
-        back, _, _ = ground_truth.flow_between(self.scene, rays, hits, now, self.time(t - 1))
+        follow = partial(ground_truth.flow_between, self.scene, rays, hits, now)
+        thread = ThreadPoolExecutor(1, "following points")
+        moved = thread.submit(follow, self.time(t + 1))
+        thread.shutdown(wait=False)  # it ends with its work
+        return Seen(hits, moved, partial(follow, self.time(t - 1)))
+
+    def _truth(self, t: int, seen: Seen) -> Callable[[], dict[str, Array]]:
+        """Cast rays to the points of frame t in frame t + 1; the result returns the truth of frame t."""
+        after = self.time(t + 1)
+        shape = self.shape
+        hits = seen.hits
+        flow, inside, then = seen.forth.result()
         self.stage.place(after)
-        # A point is seen again if the later ray to it meets nothing nearer.
-        valid = inside & ground_truth.visible(hits.distance, self._caster.cast(camera.pose(after), then))
-        return {
-            "flow": flow.reshape(2, *shape).astype(np.float32),
-            "flow_back": back.reshape(2, *shape).astype(np.float32),
-            "valid": valid.reshape(shape),
-            "depth": hits.distance.reshape(shape).astype(np.float32),
-            "body_id": hits.number.reshape(shape),
-        }
+        later = self._caster.cast(self.scene.camera.pose(after), then)
+
+        def found() -> dict[str, Array]:
+            back, _, _ = seen.back()
+            # A point is seen again if the later ray to it meets nothing nearer.
+            valid = inside & ground_truth.visible(hits.distance, later)
+            return {
+                "flow": flow.reshape(2, *shape).astype(np.float32),
+                "flow_back": back.reshape(2, *shape).astype(np.float32),
+                "valid": valid.reshape(shape),
+                "depth": hits.distance.reshape(shape).astype(np.float32),
+                "body_id": hits.number.reshape(shape),
+            }
+
+        return found
 
     @in_own_variant
     def motion_extent(self, t: int) -> tuple[Array, Array]:
