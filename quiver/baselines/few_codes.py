@@ -123,7 +123,8 @@ def second_order(sensor: Sensor, exposure: float, times: Times) -> tuple[Array, 
     """Return levels of light [G] from 0 on, and the bias of second order of the likeliest photons there, [G].
 
     It is -sum of p' p'' / p over all codes / (2 I^2) for their Fisher information I (Cox and Snell, "A general
-    definition of residuals", 1968), cut off at one standard deviation.
+    definition of residuals", 1968), cut off at one standard deviation, and at the light itself: where the first code
+    needs several electrons, dark codes tell next to nothing, and their deviation is that of bright light.
     """
     light = np.append(0.0, levels(tuple(share for share, _ in times), sensor, exposure)[::COARSE])
     above = np.zeros_like(light)
@@ -136,7 +137,7 @@ def second_order(sensor: Sensor, exposure: float, times: Times) -> tuple[Array, 
         information += count * share**2 * (weight * slope).sum(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         bias = -above / (2 * information**2)
-        most = 1 / np.sqrt(information)
+        most = np.minimum(1 / np.sqrt(information), light)
     bias[0] = 0.0  # in the dark a step of scoring is unbiased
     return light, np.where(information > 0, np.clip(bias, -most, most), 0.0)
 

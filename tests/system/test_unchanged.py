@@ -36,8 +36,9 @@ from machines import ErrorsOfLight, Fits, Rendered, Sums
 
 import qsim.cli
 import quiver.cli
-from qsim import QIS, BinarySPAD, Camera, Clip, ClipWriter, CountingSPAD, Dataset, Key, Sensor
-from qsim.descriptions import write_values
+from qsim import QIS, BinarySPAD, Camera, Clip, ClipWriter, CountingSPAD, Dataset, Key, Sensor, descriptions
+from qsim.dataset.dataset import DatasetInfo
+from qsim.dataset.series import Series
 from quiver import restore
 
 DATA = Path(__file__).parents[1] / "data"
@@ -117,15 +118,13 @@ def write_clip(path: Path, frames: int, height: int, width: int, seed: int = 0) 
 
 def write_dataset(path: Path) -> Path:
     """Two clips to train on and one to validate, as `qsim generate` lists them."""
-    jobs = {}
+    series = []
+    (path / "jobs").mkdir(parents=True)
     for seed, split in enumerate(("train", "train", "val")):
-        write_clip(path / "clips" / f"moving_{seed}", 13, 36, 44, seed)
-        jobs[f"moving_{seed}"] = {"digest": "", "scene": f"moving:{seed}", "split": split, "state": "done"}
-        record = {"clip": "0" * 64, "digest": "", "name": f"moving_{seed}", "split": split, "streams": {}}
-        (path / "jobs").mkdir(exist_ok=True)
-        (path / "jobs" / f"moving_{seed}.json").write_text(json.dumps(record))
-    about = {"format_version": 1, "name": "moving", "jobs": jobs}
-    write_values(path / "dataset.json", about)
+        write_clip(path / "clips" / f"moving_{seed:04d}", 13, 36, 44, seed)
+        (path / "jobs" / f"moving_{seed:04d}.json").touch()
+        series.append(Series(stem="moving", seeds=seed, split=split, digest="0" * 64))
+    descriptions.write(path / "dataset.json", DatasetInfo(name="moving", scenes=tuple(series)))
     return path
 
 
@@ -469,7 +468,7 @@ def _trained(data: Path, run_folder: Path, line: str) -> Results:
     history = json.loads((run_folder / "history.json").read_text())["history"]
     for key in ("loss", "psnr", "psnr_matched"):
         yield f"{line}, {key}", Sums(np.array([entry[key] for entry in history]), VIDEO_TERMS, np.float32, of="each")
-    clip = data / "clips" / "moving_2"
+    clip = data / "clips" / "moving_0002"
     video = f"{LIGHTS[0]} --method {run_folder} --threads 1"
     yield from _restored(clip, run_folder / "restored.npy", f"{line}, restored", video)
 

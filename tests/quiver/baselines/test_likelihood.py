@@ -51,3 +51,15 @@ def test_many_levels_go_the_way_of_few():
     expected = few_codes.less_bias(likeliest, sums, sensor, EXPOSURE, ((1.0, 3),))
     np.testing.assert_allclose(restored[1].ravel(), expected, rtol=1e-6)
     np.testing.assert_allclose(expected, likeliest, rtol=0.01)
+
+
+@pytest.mark.parametrize("gain", [0.02, 0.035, 0.1, 0.3, 1.0])
+@pytest.mark.parametrize("window", [1, 3, 11])
+def test_brighter_codes_are_brighter_light_at_any_gain(gain, window):
+    """Where the first code needs fifteen electrons, a dark code was restored as nearly the brightest light."""
+    sensor = QIS(0.8, 1.6, 0.2, 3, gain=gain)
+    steps = np.arange(sensor.levels, dtype=np.uint8)
+    codes = np.broadcast_to(steps, (window, 1, sensor.levels))
+    found = likelihood.restore(codes, sensor, 5e-4, window=window)[window // 2, 0]
+    assert (np.diff(found) > 0).all()
+    assert found[0] < sensor.white(5e-4) / 20
