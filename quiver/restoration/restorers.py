@@ -139,6 +139,11 @@ def _classical(name: str, method: Method, window: str, options: RestoreOptions) 
             there = partial(_restore_there, base, frames, device, memory)
             fill_classical(there, frames, codes, out, first, memory, progress)
             return
+        if is_gpu(device):
+            problem = f"{name} restores codes whose exposures take turns on a CPU"
+            if options.device != "auto":
+                raise ValueError(f"device={options.device}: {problem}; give device=cpu")
+            warnings.warn(f"{problem}, though this machine has a GPU", stacklevel=2)
         taken = method.bytes_per_pixel * codes.shape[1] * codes.shape[2]
         memory = options.bound(host=True)
         if taken > memory:

@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from qsim.keys import Key
 from qsim.sensor.qis import QIS
 from quiver.data.codes import Codes, array_codes
+from quiver.restoration import restorers
 from quiver.restoration.automatic import chosen
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.restorers import restorer
@@ -50,3 +52,15 @@ def test_auto_takes_the_likelihood():
     method, line = chosen("auto", bracketed())
     assert method.name == "likelihood"
     assert line == "auto: likelihood; the codes have different exposures"
+
+
+def test_on_a_gpu_a_cpu_restores_them_and_that_is_said(monkeypatch):
+    monkeypatch.setattr(restorers, "pick_device", lambda wanted: "cuda")
+    monkeypatch.setattr(restorers, "device_of_process", lambda kind: torch.device("cpu"))
+    monkeypatch.setattr(restorers, "is_gpu", lambda device: True)
+    with pytest.raises(ValueError, match=r"device=cuda: moment restores .* on a CPU; give device=cpu"):
+        restorer("moment", RestoreOptions(device="cuda", memory=10**9)).restore(bracketed())
+    with pytest.warns(UserWarning, match="on a CPU, though this machine has a GPU"):
+        found = restorer("moment", RestoreOptions(memory=10**9)).restore(bracketed())
+    monkeypatch.undo()
+    np.testing.assert_array_equal(found, restorer("moment").restore(bracketed()))
