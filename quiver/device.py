@@ -53,6 +53,22 @@ def light_memory(device: torch.device) -> int:
     return min(int(LIGHT_SHARE * total), free // 2)
 
 
+def environment_beside_training() -> dict[str, str]:
+    """Return the environment of a renderer beside a training: the last of several GPUs; on a CPU half of the cores.
+
+    What the user has set there stays.
+    """
+    import torch
+
+    found = dict(os.environ)
+    gpus = torch.cuda.device_count()
+    if gpus > 1:
+        found.setdefault("CUDA_VISIBLE_DEVICES", str(gpus - 1))
+    if not gpus:
+        found.setdefault("QSIM_THREADS", str(max(1, (os.cpu_count() or 1) // 2)))
+    return found
+
+
 def device_of_process(kind: str) -> torch.device:
     """Return the device of this process: under `torchrun` every process of a machine has a separate GPU."""
     import torch

@@ -29,6 +29,7 @@ from qsim.dataset.dataset import Dataset
 from qsim.dataset.job import Job
 from qsim.dataset.jobs import Jobs
 from quiver.data.growing import Schedule, planned
+from quiver.device import environment_beside_training
 
 RENDERER = (sys.executable, "-m", "quiver.data.rendering")
 PAUSE = 0.5  # s, between looks at what is finished
@@ -74,7 +75,11 @@ class Rendering:
     def __enter__(self) -> Self:
         words = [*RENDERER, self.source, str(self.folder), self.validation]
         self._process = subprocess.Popen(
-            words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=_environment(), start_new_session=True
+            words,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            env=environment_beside_training(),
+            start_new_session=True,
         )
         return self
 
@@ -166,19 +171,6 @@ def mixed(jobs: Jobs, validation: str) -> Iterator[Job]:
         if not left:
             return
         yield from (part[turn] for part in left if part[turn] != first)
-
-
-def _environment() -> dict[str, str]:
-    """Return the environment of the renderer, with its share of the machine."""
-    import torch
-
-    found = dict(os.environ)
-    gpus = torch.cuda.device_count()
-    if gpus > 1 and "CUDA_VISIBLE_DEVICES" not in found:
-        found["CUDA_VISIBLE_DEVICES"] = str(gpus - 1)
-    if not gpus and "QSIM_THREADS" not in found:
-        found["QSIM_THREADS"] = str(max(1, (os.cpu_count() or 1) // 2))
-    return found
 
 
 def _end_with(parent: int) -> None:

@@ -379,4 +379,4 @@ def test_bench(capsys, tmp_path):
     assert unet["psnr_matched"] is None  # random weights: a cost, no score
     assert 0.05 < unet["gmac_per_frame"] < 0.2
     assert {path.name for path in (tmp_path / "b").iterdir()} == {"bench.json", "bench.md", "bench.png"}
-    assert "use --force" in mistake(capsys, *words)
+    assert "replace it with --force" in mistake(capsys, *words)

@@ -17,6 +17,7 @@ from qsim.dataset.generation import Options, generate
 from quiver.cli.program import main
 from quiver.data import rendering
 from quiver.data.rendering import mixed
+from quiver.device import environment_beside_training
 from quiver.training import loop
 
 TEXT = """[recipe]
@@ -186,6 +187,6 @@ def test_the_last_of_several_gpus_renders(monkeypatch):
     monkeypatch.delenv("QSIM_THREADS", raising=False)
     for gpus, wanted in ((0, None), (1, None), (4, "3")):
         monkeypatch.setattr(torch.cuda, "device_count", lambda gpus=gpus: gpus)
-        found = rendering._environment()
+        found = environment_beside_training()
         assert found.get("CUDA_VISIBLE_DEVICES") == wanted
         assert ("QSIM_THREADS" in found) == (gpus == 0)

@@ -31,7 +31,6 @@ VALUES = {
     "summed": 7,
     "frame-rate": 500,
     "mode": "exact",
-    "device": "cpu",
     "precision": "float32",
 }
 REFUSED = {  # by kind of input, with a classical method
@@ -51,7 +50,7 @@ def test_an_option_that_cannot_act_is_refused(kind, inputs, tmp_path, capsys):
     name, *own = kind.split()
     words = ["restore", str(inputs[name]), *own, "--method", "naive", "-o", str(tmp_path / "r.npy"), "-q"]
     assert main(words) == 0
-    for option in [*REFUSED[kind], "mode", "device", "precision"]:
+    for option in [*REFUSED[kind], "mode", "precision"]:
         other = [*words, f"--{option}", str(VALUES[option])]
         other[other.index(str(tmp_path / "r.npy"))] = str(tmp_path / "other.npy")
         assert main(other) == 2, option
@@ -101,7 +100,6 @@ def test_the_other_options_change_the_answer(inputs, tmp_path):
         (["--stream", "mine", "--published"], "--published"),
         (["--mode", "streaming"], "--mode"),
         (["--precision", "bfloat16"], "--precision"),
-        (["--device", "cpu"], "--device"),
     ],
 )
 def test_an_evaluation_refuses_what_it_would_ignore(inputs, tmp_path, capsys, words, option):

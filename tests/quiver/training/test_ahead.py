@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -184,7 +185,8 @@ def test_a_step_waits_for_nothing(tmp_path, monkeypatch, name, optimiser, loss):
     makers = {"quiver": lambda: QUIVER(TINY), "unet": small_network, "mergenet": lambda: MergeNet(MergeNetConfig(4))}
     network = makers[name]().to("meta")
     asked = settings(Path("none"), tmp_path / "r", optimiser=optimiser, loss=loss, batch=2, accumulate=2)
-    trainer = Trainer(network, Run(asked), None, Process(0, 1, torch.device("meta")), system_of(network))
+    system = replace(system_of(network), prepare_batch=None)  # the batch has its inputs
+    trainer = Trainer(network, Run(asked), None, Process(0, 1, torch.device("meta")), system)
     batch = batch_of(network, "meta")
     trainer.step(batch)  # makes what the optimiser keeps
     with listed_waits() as (waits, operators):
