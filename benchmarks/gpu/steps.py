@@ -41,7 +41,8 @@ def measure(job: Job) -> list[dict[str, Any]]:
     if job.name == "operators":
         return _operators(job)
     if job.name == "compiled":
-        batch, frames = job.sizes.compiled_batch, job.sizes.step_frames[-1]
+        batch = job.sizes.compiled_batch
+        frames = job.sizes.step_frames[-1]
         return [_row(job, batch, frames, compile=kind) for kind in job.sizes.compiled]
     _, frames, precision = job.name.split("-")
     rows = []
@@ -115,7 +116,9 @@ def clips_of_pattern(job: Job) -> list[Any]:
     from qsim import Camera, Clip, ClipWriter
 
     sizes = job.sizes
-    height, width, frames = sizes.step_height, sizes.step_width, max(sizes.step_frames) + 4
+    height = sizes.step_height
+    width = sizes.step_width
+    frames = max(sizes.step_frames) + 4
     t, y, x = np.ogrid[:frames, :height, :width]
     found = []
     for seed in range(2):

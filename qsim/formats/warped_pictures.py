@@ -44,10 +44,12 @@ STILL = 0.15  # share of clips in which nothing moves
 FASTEST_GROWTH = 0.05  # of the zoom, per frame
 SMOOTH = 0.25  # share of bodies with a smooth tone instead of a picture
 SHAKE = 0.4  # of the largest motion, to which a camera shakes
-SLOWEST, FASTEST = 0.05, 1.2  # rad/frame, of the waves of a shaking hand
+SLOWEST = 0.05  # rad/frame, of the waves of a shaking hand
+FASTEST = 1.2  # the same
 STRUCK = 0.3  # share of shaking cameras that are struck
 RINGING = (0.25, 0.8)  # rad/frame, of a struck camera
-LEAST_REPEAT, MOST_REPEAT = 2, 24  # px, period of a pattern
+LEAST_REPEAT = 2  # px, shortest period of a pattern
+MOST_REPEAT = 24  # px, longest
 WINDOWS = 0.5  # share of patterns that are a pane in a wall instead of a part of a picture
 
 
