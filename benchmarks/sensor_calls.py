@@ -13,6 +13,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -37,17 +38,20 @@ def ways(sensor: Any, shape: tuple[int, int, int, int]) -> dict[str, Callable[[i
     tensor = torch.from_numpy(light)
     frames = tensor.reshape(clip.shape)
 
-    def rows(call: int) -> Any:
+    def rows(call: int, packed: bool = False) -> Any:
         exposure = EXPOSURE * (1 + call % 7 / 10)
         described = [Row(sensor, exposure, Key(0, clip=call, frame=b), 1 + call % 5 / 10) for b in range(shape[0])]
-        return codes_of_rows(tensor, described)
+        return codes_of_rows(tensor, described, packed)
 
-    return {
+    found: dict[str, Callable[[int], Any]] = {
         "numpy": lambda call: sensor.sample(clip, EXPOSURE, key=Key(0, call), engine="reference"),
         "sample": lambda call: sensor.sample(clip, EXPOSURE, key=Key(0, call)),
         "codes_on_device": lambda call: codes_on_device(sensor, frames, EXPOSURE, key=Key(0, call)),
         "rows": rows,
     }
+    if sensor.bits == 1:
+        found["rows, packed"] = partial(rows, packed=True)
+    return found
 
 
 def kernels(draw: Callable[[int], Any]) -> dict[str, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from job import Absent, Job, median_seconds
@@ -98,11 +99,16 @@ def _on_device(where: str, sizes: Sizes) -> list[dict[str, Any]]:
     batch = photons.unsqueeze(1)  # each frame a window with a key of its own
     for what, device in ((THREE_BITS, sensor), (ONE_BIT, BinarySPAD(0.5, 25.0))):
         rows = [Row(device, EXPOSURE, key.at(t)) for t in range(len(batch))]
-        drawn = codes_of_rows(batch, rows)[:, 0].cpu().numpy()
-        wrong = float(np.mean(drawn != device.sample(light, EXPOSURE, key=key)))
-        seconds = median_seconds(lambda rows=rows: codes_of_rows(batch, rows), sizes.rounds, lambda: wait(place))
-        label = f"{what} of {len(rows)} windows in one launch, from device to a torch tensor on {codes.device.type}"
-        found.append(_row(where, label, light.size / seconds / 1e9, **{"differing per million": 1e6 * wrong}))
+        expected = device.sample(light, EXPOSURE, key=key)
+        for packed in (False, True)[: 1 + (device.bits == 1)]:
+            drawn = codes_of_rows(batch, rows, packed)[:, 0].cpu().numpy()
+            drawn = np.unpackbits(drawn, axis=-1, count=width) if packed else drawn
+            wrong = float(np.mean(drawn != expected))
+            draw = partial(codes_of_rows, batch, rows, packed)
+            seconds = median_seconds(draw, sizes.rounds, lambda: wait(place))
+            form = f"{what}, packed," if packed else what
+            label = f"{form} of {len(rows)} windows in one launch, from device to a torch tensor on {codes.device.type}"
+            found.append(_row(where, label, light.size / seconds / 1e9, **{"differing per million": 1e6 * wrong}))
     return found
 
 

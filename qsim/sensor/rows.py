@@ -2,8 +2,8 @@
 
     light [B, T, H, W] on the device, and a Row for each of the B -> compiled/rows_kernel.py -> codes on the device
 
-The codes are those of `Sensor.sample`. No code goes to the host, and a GPU is not waited for. Another key, clip, frame,
-exposure, light level or size compiles nothing.
+The codes are those of `Sensor.sample`, or binary ones packed by rows as packing.py packs them. No code goes to the
+host, and a GPU is not waited for. Another key, clip, frame, exposure, light level or size compiles nothing.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ LIGHT = {"float16": "f16", "float32": "f", "float64": "f64"}  # types of light, 
 
 
 @one_thread_in_order
-def draw_rows(light: Any, shape: tuple[int, int, int, int], rows: Sequence[Row]) -> Any:
+def draw_rows(light: Any, shape: tuple[int, int, int, int], rows: Sequence[Row], packed: bool = False) -> Any:
     """Return codes as Dr.Jit's Int32 [B T H ceil(W / 4)] on the device: four in a number, the first one lowest.
 
+    With `packed` binary codes are packed: UInt8 [B T H ceil(W / 8)], each row of pixels as `numpy.packbits` packs it.
     `light` holds the B T H W numbers of `shape` in a line, float16, float32 or float64: a NumPy array, or one of a
     library that knows DLPack, which stays on its device. Light is finite and not negative: nobody looks at it, and
     codes of other light have no meaning.
-    `ValueError` for rows that do not fit the shape, for a sensor whose law no table holds, and for a machine without a
-    compiled engine.
+    `ValueError` for rows that do not fit the shape, for codes of more bits to pack, for a sensor whose law no table
+    holds, and for a machine without a compiled engine.
     """
     kind = LIGHT.get(str(light.dtype).rpartition(".")[2])
     if len(shape) != 4 or not 0 < prod(shape) <= MOST_PIXELS or tuple(light.shape) != (prod(shape),) or kind is None:
@@ -44,6 +45,8 @@ def draw_rows(light: Any, shape: tuple[int, int, int, int], rows: Sequence[Row])
         require_counters(row.key, shape[1:], row.origin, 1 if row.at_once else row.sensor.counters)
         if not (isfinite(row.scale) and row.scale >= 0):
             raise ValueError(f"Row.scale is finite and not negative, got {row.scale!r}")
+        if packed and row.sensor.bits != 1:
+            raise ValueError(f"packed= is for codes of 1 bit, and {row.sensor!r} has {row.sensor.bits}; leave it out")
     if fast_engine_works():
         from qsim.sensor.compiled import draw_rows as compiled
         from qsim.sensor.compiled import jit
@@ -56,5 +59,5 @@ def draw_rows(light: Any, shape: tuple[int, int, int, int], rows: Sequence[Row])
             draws.append(draw)
         if jit.available():
             given = jit.in_aligned(light) if isinstance(light, np.ndarray) else light
-            return compiled.draw(given, kind, shape, draws)
+            return compiled.draw(given, kind, shape, draws, packed)
     raise ValueError("no compiled engine draws codes on this machine; use `sample`")

@@ -238,15 +238,17 @@ class Sensor(Distribution):
         `at_once`: a sum of planes is drawn from one number per pixel.
         """
         from qsim.sensor.compiled.draw_rows import Draw
-        from qsim.sensor.compiled.row_tables import has_table
+        from qsim.sensor.compiled.row_tables import table_of
 
         drawn = self if at_once else self.plane
-        law = (drawn, exposure if drawn.law_follows_exposure else 1.0)
-        if not self.tabulated or self.bits > MOST_BITS or not has_table(law):
+        if not self.tabulated or self.bits > MOST_BITS:
+            return None
+        table = table_of(drawn, exposure if drawn.law_follows_exposure else 1.0)
+        if table is None:
             return None
         planes = 1 if at_once else self.counters
         efficiency = scale * self.efficiency / planes
-        return Draw(law, efficiency, self.dark_rate * exposure / planes, planes, key, origin)
+        return Draw(table, efficiency, self.dark_rate * exposure / planes, planes, key, origin)
 
     def draw_at(self, photons: Array, exposure: float, *, key: Key, at: Array) -> Array:
         """Return the reference's codes [p] of single pixels: photons [p], `at` int [3, p] = (frame, row, column).

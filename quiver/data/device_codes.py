@@ -31,8 +31,10 @@ def codes_on_device(
     return torch.from_dlpack(sensor.sample_on_device(photons, exposure, key=key, origin=origin))
 
 
-def codes_of_rows(light: Tensor, rows: Sequence[Row]) -> Tensor:
+def codes_of_rows(light: Tensor, rows: Sequence[Row], packed: bool = False) -> Tensor:
     """Return the codes uint8 [B, T, H, W] of a batch of windows, drawn in one launch where Dr.Jit draws.
+
+    With `packed` those of binary sensors, packed by rows as `qsim.sensor.packing` packs them: [B, T, H, ceil(W / 8)].
 
     `light` [B, T, H, W] is float16, float32 or float64, on that device or on the host; `rows[b].scale` times it are the
     expected photons. The codes equal `rows[b].sensor.sample` of these photons, or `code_table.draw_codes` with
@@ -46,6 +48,6 @@ def codes_of_rows(light: Tensor, rows: Sequence[Row]) -> Tensor:
     if given.data_ptr() % _ALIGNED:  # other memory needs another kernel
         given = given.clone()
     follow(given.device)
-    drawn = draw_rows(given, (shape[0], shape[1], shape[2], shape[3]), rows)
-    codes = torch.from_dlpack(drawn).view(torch.uint8).reshape(*shape[:3], -1)
-    return codes[..., : shape[3]]
+    drawn = torch.from_dlpack(draw_rows(given, (shape[0], shape[1], shape[2], shape[3]), rows, packed))
+    codes = drawn.view(torch.uint8).reshape(*shape[:3], -1)
+    return codes if packed or shape[3] == codes.shape[3] else codes[..., : shape[3]]

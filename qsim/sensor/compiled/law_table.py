@@ -60,6 +60,11 @@ class LawTable:
         """Return the number of steps: codes beside 0."""
         return self.fast.shape[1]
 
+    @property
+    def bits(self) -> int:
+        """Return the bits of a code."""
+        return self.steps.bit_length()
+
     def padded(self, steps: int) -> LawTable:
         """Return the same with so many steps; no number passes those that are added."""
         more = ((0, 0), (0, steps - self.steps), (0, 0))

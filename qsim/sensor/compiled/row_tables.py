@@ -14,25 +14,11 @@ from qsim.sensor.distribution import Distribution
 
 _MOST_LAWS = 64  # held on the device; beyond them those that are not in use are left out
 
-Law = tuple[Distribution, float]  # and the exposure [s]
-
 
 @lru_cache(maxsize=2 * _MOST_LAWS)
-def _made(law: Law) -> LawTable | None:
-    distribution, exposure = law
+def table_of(distribution: Distribution, exposure: float) -> LawTable | None:
+    """Return the table of a law at an exposure [s], made once; None where it would be too large."""
     return LawTable.of(distribution, exposure)
-
-
-def has_table(law: Law) -> bool:
-    """Return whether a law has a table; that of some would be too large."""
-    return _made(law) is not None
-
-
-def table_of(law: Law) -> LawTable:
-    """Return the table of a law that has one, made once."""
-    found = _made(law)
-    assert found is not None
-    return found
 
 
 class Tables:
@@ -40,19 +26,19 @@ class Tables:
 
     def __init__(self, bits: int) -> None:
         self.bits = bits
-        self.places: dict[Law, tuple[int, int]] = {}  # the first cell and the number of cells
+        self.places: dict[LawTable, tuple[int, int]] = {}  # the first cell and the number of cells
         self.fast: Any = None
         self.exact: Any = None
 
-    def hold(self, laws: set[Law]) -> None:
-        """Copy the tables of laws to the device, unless they are there; each has a table of at most these bits."""
-        if laws <= self.places.keys():
+    def hold(self, wanted: set[LawTable]) -> None:
+        """Copy tables of at most these bits to the device, unless they are there."""
+        if wanted <= self.places.keys():
             return
         import drjit as dr
 
-        others = [law for law in self.places if law not in laws]
-        held = [*others[: max(0, _MOST_LAWS - len(laws))], *laws]
-        padded = [table_of(law).padded((1 << self.bits) - 1) for law in held]
+        others = [table for table in self.places if table not in wanted]
+        held = [*others[: max(0, _MOST_LAWS - len(wanted))], *wanted]
+        padded = [table.padded((1 << self.bits) - 1) for table in held]
         counts = [len(table.fast) for table in padded]
         firsts = np.cumsum([0, *counts[:-1]]).tolist()
         self.places = dict(zip(held, zip(firsts, counts, strict=True), strict=True))

@@ -76,6 +76,16 @@ def test_codes_of_rows_are_those_of_training_windows(kind):
 
 
 @needs_engine
+@pytest.mark.parametrize("width", [16, 18, 21])
+def test_packed_codes_of_rows_are_those_of_the_same_rows(width):
+    photons = torch.rand((3, 2, 7, width), generator=torch.Generator().manual_seed(1))
+    rows = [Row(BinarySPAD(0.5, 10.0 + n), EXPOSURE, Key(seed=1, clip=n), scale=1.0 + n) for n in range(3)]
+    codes = codes_of_rows(photons, rows).cpu().numpy()
+    found = codes_of_rows(photons, rows, packed=True)
+    assert np.array_equal(found.cpu().numpy(), np.packbits(codes, axis=-1))
+
+
+@needs_engine
 def test_no_host_waits_for_codes_of_a_gpu(monkeypatch):
     """Nothing is fetched or waited for between light and codes on a device that has its own queue."""
     dr = loaded_drjit()

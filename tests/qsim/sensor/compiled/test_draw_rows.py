@@ -13,6 +13,7 @@ from qsim.keys import Key
 from qsim.sensor.compiled import rows_kernel
 from qsim.sensor.compiled.law_table import LawTable
 from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.packing import pack
 from qsim.sensor.qis import QIS
 from qsim.sensor.row import Row
 from qsim.sensor.rows import draw_rows
@@ -79,6 +80,37 @@ def test_rows_of_random_sensors_keys_and_places_equal_the_reference(seed):
     np.testing.assert_array_equal(drawn(light, rows), expected(light, rows))
 
 
+def some_binary(rng: np.random.Generator) -> Sensor:
+    """Return a sensor of one bit with random parameters."""
+    dark = float(10 ** rng.uniform(-2, 3.5))
+    if rng.integers(2):
+        return BinarySPAD(float(rng.uniform(0.05, 1)), dark)
+    return QIS(float(rng.uniform(0.05, 1)), dark, float(rng.uniform(0, 1.5)), 1, float(rng.uniform(0.2, 3)))
+
+
+@needs_engine
+@pytest.mark.parametrize("seed", range(12))
+def test_packed_rows_of_random_sensors_are_the_packed_codes_of_the_reference(seed):
+    """Of any width, also of no whole byte, and from any column of the full frame on."""
+    rng = np.random.default_rng(seed)
+    rows = [some_row(rng, some_binary(rng)) for _ in range(int(rng.integers(1, 5)))]
+    shape = (len(rows), *(int(n) for n in rng.integers(1, (4, 20, 60))))
+    light = (rng.uniform(size=shape) ** 2).astype([np.float16, np.float32, np.float64][seed % 3])
+    found = draw_rows(light.reshape(-1), shape, rows, packed=True).numpy()
+    assert found.dtype == np.uint8
+    np.testing.assert_array_equal(found.reshape(*shape[:3], -1), pack(expected(light, rows), 1))
+
+
+@needs_engine
+@pytest.mark.parametrize("width", [1024, 1021])
+def test_undecided_pixels_of_packed_rows_are_decided_on_the_device(width):
+    sensor = BinarySPAD(0.5, 25.0)
+    light = np.random.default_rng(2).uniform(0, 3, (1, 1, 1024, width)).astype(np.float32)
+    found = draw_rows(light.reshape(-1), light.shape, [Row(sensor, EXPOSURE, KEY)], packed=True).numpy()
+    wanted = pack(expected(light, [Row(sensor, EXPOSURE, KEY)]), 1)
+    np.testing.assert_array_equal(found.reshape(wanted.shape), wanted)
+
+
 @needs_engine
 @pytest.mark.parametrize("name", QUICK)
 def test_codes_of_every_law_equal_the_reference(name):
@@ -126,7 +158,7 @@ def test_a_batch_is_one_launch_and_nothing_is_compiled_again():
     ]
     launches = []
     recordings = []
-    kernel = rows_kernel.kernel(bits=3, light="f", summing=False, shifted=False, whole=True)
+    kernel = rows_kernel.kernel(bits=3, light="f", summing=False, shifted=False, whole=True, pixels=rows_kernel.FOUR)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         for count, change in changes:
             light = rng.uniform(size=(count, 2, 8, 32)).astype(np.float32)
@@ -153,6 +185,8 @@ def test_rows_that_do_not_fit_are_refused():
         draw_rows(light, (2, 1, 5, 7), [row, replace(row, scale=-1.0)])
     with pytest.raises(ValueError, match="columns 4294967290 to 4294967296"):
         draw_rows(light, (2, 1, 5, 7), [row, replace(row, origin=(0, (1 << 32) - 6))])
+    with pytest.raises(ValueError, match=r"packed= is for codes of 1 bit, and QIS\(.* has 3; leave it out"):
+        draw_rows(light, (2, 1, 5, 7), [row, row], packed=True)
     for sensor in OTHERS.values():
         with pytest.raises(ValueError, match="no table holds the law of its codes; use `sample`"):
             draw_rows(light, (2, 1, 5, 7), [row, replace(row, sensor=sensor)])
