@@ -104,6 +104,33 @@ def white_in(radiance: Array) -> float:
     return white_of(float(radiance.mean()), bright_end(radiance))
 
 
+@dataclass(frozen=True, eq=False)
+class Clamp:
+    """What errors of a picture clamped at one white need, whatever they are without a clamp."""
+
+    below: Array  # bool [...], the picture is below white
+    distance: Array  # [...], squared distance of the darker half to white
+    stray: float  # mean light above white of pixels whose darker half is below
+
+    @classmethod
+    def at(cls, white: float, picture: Array, lower: Array) -> Clamp:
+        """Return the clamp of a picture [...] at white; `lower` [...] is the darker of two estimates of each pixel."""
+        # Large arrays cost what their memory does: each is made once, and changed in place.
+        over = picture - white
+        np.maximum(over, 0, out=over)
+        over *= lower < white
+        distance = np.minimum(lower, white)
+        np.subtract(white, distance, out=distance)
+        distance *= distance
+        return cls(picture < white, distance, float(np.mean(over)))
+
+    def squares(self, squares: Array | float) -> Array:
+        """Return squared errors [...] of clamped pixels from those without a clamp, as `clamped_squares`."""
+        clamped = np.where(self.below, squares, self.distance)
+        clamped += self.stray**2
+        return clamped
+
+
 def clamped_squares(squares: Array, picture: Array, lower: Array, white: float) -> Array:
     """Return squared errors [...] of pixels clamped at white, from squared errors [...] without a clamp.
 
@@ -112,8 +139,7 @@ def clamped_squares(squares: Array, picture: Array, lower: Array, white: float) 
     light of such pixels above white is missing in all others, and each of them errs by its share of it.
     """
     # Light that a few bright paths bring to some pixels is missing in all others, on average: a bias of all.
-    stray = float(np.mean(np.where(lower < white, np.maximum(picture - white, 0), 0)))
-    return np.where(picture < white, squares, (white - np.minimum(lower, white)) ** 2) + stray**2
+    return Clamp.at(white, picture, lower).squares(squares)
 
 
 def whites_around(white: float) -> list[float]:

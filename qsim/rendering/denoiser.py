@@ -29,7 +29,7 @@ from typing import TypeVar
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clamped_error import clamped_squares
+from qsim.clip.clamped_error import Clamp, clamped_squares
 from qsim.lazy_array import Crop
 
 AROUND = 33  # px, side of the square around a pixel in which errors are compared
@@ -85,8 +85,9 @@ class Mixture:
 
     def error_at(self, white: float, sigmas: float = 1.0) -> float:
         """Return the rms error of picture and truth clamped at white, plus `sigmas` of its standard errors."""
-        squares = clamped_squares(self.squares, self.picture, self.lower, white)
-        least = float(np.mean(np.where(self.picture < white, self.noise, 0)))
+        clamp = Clamp.at(white, self.picture, self.lower)
+        squares = clamp.squares(self.squares)
+        least = float(np.mean(np.where(clamp.below, self.noise, 0)))
         return _root(squares, np.minimum(self.raw, white**2), sigmas, least)
 
     def deviation_at(self, white: float) -> float:

@@ -201,8 +201,8 @@ class Renderer:
             plane = self._plane(t, with_truth)
             return lambda: plane
         # Of an instant the truth's rays go first, so that the host follows their points while paths are traced.
-        early = self._seen(t) if with_truth and self.shutter == 0 and not self._whole else None
-        exposed = self._shared(t, self._whole) if self._whole else self._exposed(self.instants(t), self.key(t))
+        early = self._seen(t) if with_truth and self.shutter == 0 else None
+        exposed = self._shared(t, self._whole, early) if self._whole else self._exposed(self.instants(t), self.key(t))
         of_sharp = None
         if self.shutter > 0 and self.budget.sharp:  # the truth of scores: the larger error of both is stated
             of_sharp = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))
@@ -346,11 +346,16 @@ class Renderer:
         key = partial(self.key, stage=stage)
         return Carrier(self.stage, self.film, self._caster, integrator, each, budget.neighbours, every, self.time, key)
 
-    def _shared(self, t: int, whole: Renderer) -> Callable[[], Exposed]:
-        """Return the same as `_exposed` of a frame that shares samples, cut from the complete frame."""
-        pictures = self._carrier.pictures(t)
-        # The denoiser sees the complete frame, as windows of it would have other edges.
+    def _shared(self, t: int, whole: Renderer, seen: Seen | None) -> Callable[[], Exposed]:
+        """Return the same as `_exposed` of a frame that shares samples, cut from the complete frame.
+
+        `seen` is what is seen through the pixel centres of this renderer, if that is known.
+        """
+        # The denoiser sees the complete frame, as windows of it would have other edges. Surfaces come first: the scene
+        # is at frame t already, and pictures move it to later frames.
         surfaces = whole.surfaces([self.time(t)], self.key(t)) if self.budget.denoise else None
+        complete = self.crop == whole.crop and self.film.thinned == 1
+        pictures = self._carrier.pictures(t, seen.hits if seen is not None and complete else None)
         return partial(self._cut, pictures, surfaces)
 
     def _cut(self, pictures: Array, surfaces: tuple[Array, Array] | None) -> Exposed:

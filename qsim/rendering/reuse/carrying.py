@@ -29,7 +29,7 @@ from qsim.rendering.camera_rays import Film
 from qsim.rendering.engine import in_own_variant
 from qsim.rendering.ground_truth import body_pose
 from qsim.rendering.mitsuba_scene import Stage
-from qsim.rendering.ray_casting import RayCaster, pixel_rays
+from qsim.rendering.ray_casting import Hits, RayCaster, pixel_rays
 from qsim.scene import Scene
 
 NEAR = 0.03  # relative difference of depth within one layer
@@ -96,11 +96,12 @@ class Carrier:
         return self.stage.variant
 
     @in_own_variant
-    def pictures(self, t: int) -> Array:
+    def pictures(self, t: int, centres: Hits | None = None) -> Array:
         """Return pictures of frame t from 1, 3, 5 ... frames, float64 [n, 2 halves, H, W]; the first is its own.
 
         The number of frames follows REACH up to `neighbours`, which is the last; frames outside the clip are missing.
-        Places the stage at frame t. `ValueError` for a frame outside the clip.
+        `centres` are the first hits [H W] behind the pixels' centres, if they are known. Places the stage at frame t
+        first, and then where samples are missing. `ValueError` for a frame outside the clip.
         """
         if t not in self.frames:
             raise ValueError(f"frame {t}: the frames that share samples are {self.frames[0]} to {self.frames[-1]}")
@@ -108,13 +109,17 @@ class Carrier:
         # Frames are asked for in order: each is traced once, and forgotten when no later picture needs it.
         for s in set(self._kept) - set(wanted):
             del self._kept[s]
+        self.stage.place(self.time(t))
+        if t not in self._kept:
+            self._kept[t] = self._traced(t)
+        own = self._own(self._kept[t])
+        if centres is None:
+            centres = self.caster.cast(self._kept[t].view, pixel_rays(self.film.camera, self.film.crop))
+        layers = _Layers(self, t, self._kept[t], centres, float(np.mean(own, where=np.isfinite(own))))
+        layers.add(self._kept[t])
         for s in wanted:
             if s not in self._kept:
                 self._kept[s] = self._traced(s)
-        own = self._own(self._kept[t])
-        self.stage.place(self.time(t))
-        layers = _Layers(self, t, self._kept[t], float(np.mean(own, where=np.isfinite(own))))
-        layers.add(self._kept[t])
         found = [own]
         done = 0
         for reach in (*(k for k in REACH if k < self.neighbours), self.neighbours):
@@ -160,7 +165,7 @@ class Carrier:
 class _Layers:
     """Sums of samples in the two layers of each pixel of frame t, by halves."""
 
-    def __init__(self, carrier: Carrier, t: int, target: Traced, mean: float) -> None:
+    def __init__(self, carrier: Carrier, t: int, target: Traced, hits: Hits, mean: float) -> None:
         import drjit as dr
 
         self.carrier = carrier
@@ -168,7 +173,6 @@ class _Layers:
         self.target = target
         self.mi = carrier.stage.mi
         self.pixels = math.prod(carrier.film.shape)
-        hits = carrier.caster.cast(target.view, pixel_rays(carrier.film.camera, carrier.film.crop))
         self.inverse = self.mi.Float((1 / hits.distance).astype(np.float32))
         self.body = self.mi.UInt32((hits.number + 1).astype(np.uint32))
         self.step = (mean if mean > 0 else 1.0) / FINE

@@ -142,10 +142,11 @@ class Trial:
         for crop in windows(camera):
             window = renderer.window(crop)
             budget = Budget(samples, need.bounces, neighbours=most)
+            # First: pictures move the scene to other frames.
+            surfaces = window.surfaces([renderer.time(t)], renderer.key(t, STAGE)) if any(kinds) else None
             pictures = window.carrier(budget, need.frames, STAGE).pictures(t)
             pictures[:, :, ~np.isfinite(pictures[0]).all(axis=0)] = 0  # as in frames
             noisy = Errors.of_halves(pictures[0], white).plain
-            surfaces = window.surfaces([renderer.time(t)], renderer.key(t, STAGE)) if any(kinds) else None
             for kind in kinds:
                 for count, k in enumerate(reaches, 2):
                     best, _ = best_of(pictures[:count], white, bool(kind))

@@ -10,6 +10,7 @@ from stats import critical_z
 
 from qsim.clip.clamped_error import (
     STEPS,
+    Clamp,
     Errors,
     clamped_squares,
     error_at,
@@ -55,6 +56,22 @@ def test_two_halves_give_the_error_at_white(seed):
     assert Errors.of_halves(halves, white).at_white == pytest.approx(math.sqrt(found.mean()))
     chance = critical_z(checks=40) * math.hypot(real.std(), found.std()) / SIZE
     assert 0.85 * real.mean() - chance < found.mean() < 1.35 * real.mean() + chance
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_squares_of_a_clamp_are_those_of_its_law_to_the_bit(seed):
+    """The law in single steps, with whites that no pixel, some and all reach, and squares that are one number."""
+    rng = np.random.default_rng([8, seed])
+    halves = rng.gamma(2.0, 1.0, (2, *rng.integers(1, 40, 2)))
+    picture = halves.mean(axis=0)
+    lower = halves.min(axis=0)
+    squares = (halves[0] - halves[1]) ** 2 / 4 if seed % 2 else 0.25
+    for white in (0.01, *rng.uniform(0.5, 5.0, 3), math.inf):
+        stray = float(np.mean(np.where(lower < white, np.maximum(picture - white, 0), 0)))
+        wanted = np.where(picture < white, squares, (white - np.minimum(lower, white)) ** 2) + stray**2
+        clamp = Clamp.at(white, picture, lower)
+        np.testing.assert_array_equal(clamp.squares(squares), wanted)
+        np.testing.assert_array_equal(clamp.below, picture < white)
 
 
 def test_without_anything_above_white_the_clamp_changes_nothing():

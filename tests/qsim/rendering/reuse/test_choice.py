@@ -34,6 +34,28 @@ def test_tiles_take_many_frames_where_they_are_right_and_their_own_where_they_ar
     assert whole[0] < min(whole[1:])
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_products_are_those_of_numpy_s_sums_to_the_bit(seed):
+    """Sums by rows and `np.add.reduceat` add the same numbers in the same order, at the last squares, too."""
+    rng = np.random.default_rng([19, seed])
+    apart = rng.standard_normal((2, *rng.integers(1, 60, 2)))
+    rows, columns = (np.arange(0, size, BLOCK) for size in apart.shape[1:])
+
+    def sums(values):
+        return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
+
+    np.testing.assert_array_equal(products(apart), sums(apart[0]) * sums(apart[1]) / sums(np.ones(apart.shape[1:])))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_tile_has_the_picture_of_its_number(seed):
+    rng = np.random.default_rng([23, seed])
+    pictures = rng.gamma(2.0, 1.0, (4, 2, *rng.integers(TILE, 60, 2)))
+    best, number = best_of(pictures, 2.0, bool(seed % 2))
+    spread = np.repeat(np.repeat(number, TILE, axis=0), TILE, axis=1)[: best.shape[1], : best.shape[2]]
+    np.testing.assert_array_equal(best, np.take_along_axis(pictures, spread[None, None], axis=0)[0])
+
+
 def test_a_tile_does_not_choose_for_itself():
     _, pictures = drawn(1, np.zeros(SIZE))
     _, before = best_of(pictures, 10.0, True)
