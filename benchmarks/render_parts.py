@@ -11,6 +11,7 @@ another thread run beside those of the first, and are marked. Each part is witho
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 import tempfile
@@ -24,19 +25,31 @@ from typing import Any
 import scenes
 from qsim import files
 from qsim.clip import exr, writer
-from qsim.rendering import clip_rendering, ground_truth, renderer
-from qsim.rendering.budget import Budget
+from qsim.rendering import clip_rendering, denoiser, ground_truth, renderer
+from qsim.rendering.budget import DENOISE_COST, Budget
 from qsim.rendering.mitsuba_scene import Stage
 from qsim.rendering.ray_casting import RayCaster
+from qsim.rendering.reuse import carrying, choice
 
+FIRST = 2  # frames that do not count
 PARTS: tuple[tuple[Any, str, str], ...] = (
     (Stage, "place", "scene update"),
     (Stage, "light", "scene update"),
     (renderer.Renderer, "means", "paths"),
+    (carrying.Carrier, "_traced", "paths"),
+    (carrying.Carrier, "pictures", "carried samples, the rest"),
+    (carrying._Layers, "_coverage", "coverage"),
+    (carrying._Layers, "add", "carried samples"),
+    (carrying._Layers, "picture", "carried samples, pictures"),
     (renderer.Renderer, "surfaces", "surfaces"),
-    (renderer, "cleaned_mean", "denoiser"),
+    (denoiser, "denoised", "denoiser"),
+    (choice, "denoised", "denoiser"),
+    (renderer, "cleaned_mean", "mixture"),
+    (renderer, "reused_mean", "mixture"),
+    (renderer, "best_of", "choice by tiles"),
     (renderer.Renderer, "_finished", "statistics"),
     (renderer.Renderer, "_shared", "statistics"),
+    (renderer.Renderer, "_cut", "statistics"),
     (renderer.Renderer, "_seen", "truth"),
     (renderer.Renderer, "_truth", "truth"),
     (ground_truth, "flow_between", "truth, flow"),
@@ -45,6 +58,10 @@ PARTS: tuple[tuple[Any, str, str], ...] = (
     (files, "write_bytes", "files and checksums"),
     (writer.ClipWriter, "add", "writer, the rest"),
 )
+
+
+class Enough(Exception):
+    """All frames that count are rendered."""
 
 
 class Clock:
@@ -94,28 +111,46 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=8, help="samples per pixel")
     parser.add_argument("--bounces", type=int, default=4, help="bounces of a path")
     parser.add_argument("--frames", type=int, default=4, help="frames that count")
-    parser.add_argument("--denoise", action="store_true", help="denoise")
+    parser.add_argument("--seed", type=int, default=3, help="seed of the scene")
+    parser.add_argument("--speed", type=float, default=1.0, help="factor of every motion")
+    parser.add_argument("--denoise", choices=list(DENOISE_COST), default="", help="denoise with this quality")
+    parser.add_argument("--neighbours", type=int, default=0, help="frames on each side that share samples")
     asked = parser.parse_args()
-    scene = scenes.load(asked.family, seed=3).resized(*asked.size)
-    budget = Budget(samples=asked.samples, bounces=asked.bounces, denoise=asked.denoise)
+    scene = scenes.load(asked.family, seed=asked.seed, speed=asked.speed).resized(*asked.size)
+    budget = Budget(
+        samples=asked.samples,
+        bounces=asked.bounces,
+        denoise=bool(asked.denoise),
+        quality=asked.denoise or "high",
+        neighbours=asked.neighbours,
+    )
     engine = renderer.Renderer(scene, budget=budget).engine  # loads Dr.Jit with its LLVM
     import drjit
 
     clock = Clock()
     for place, name, part in PARTS:
         setattr(place, name, clock.part(part, getattr(place, name)))
-    begun: list[tuple[float, float]] = []
+    marks: list[tuple[float, float]] = []
+    sums: dict[tuple[str, bool], tuple[float, ...]] = {}
 
     def progress(done: int, _: int) -> None:
-        if done == 2:  # the first frames load and compile
+        if done == FIRST:  # the first frames load and compile
             clock.sums.clear()
             drjit.kernel_history_clear()
-        begun.append((time.perf_counter(), time.process_time()))
+        # At both marks one frame more than `done` is traced: the last of a clip, which nothing follows, does not count.
+        if done in (FIRST, FIRST + asked.frames):
+            marks.append((time.perf_counter(), time.process_time()))
+            sums.update((part, tuple(spent)) for part, spent in clock.sums.items())
+        if done == FIRST + asked.frames:
+            raise Enough
 
-    with tempfile.TemporaryDirectory() as folder, drjit.scoped_set_flag(drjit.JitFlag.KernelHistory, True):
-        clip_rendering.render_clip(
-            scene, Path(folder) / "clip", frames=asked.frames + 2, budget=budget, progress=progress
-        )
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        drjit.scoped_set_flag(drjit.JitFlag.KernelHistory, True),
+        contextlib.suppress(Enough),
+    ):
+        frames = FIRST + asked.frames + 1 + asked.neighbours
+        clip_rendering.render_clip(scene, Path(folder) / "clip", frames=frames, budget=budget, progress=progress)
     rows = [
         {
             "part": part,
@@ -126,9 +161,9 @@ def main() -> None:
             "processor": round(1e3 * processor / asked.frames, 1),
             "processor, outside": round(1e3 * processor * (1 - kernels / spent) / asked.frames, 1),
         }
-        for (part, first), (spent, kernels, processor) in clock.sums.items()
+        for (part, first), (spent, kernels, processor) in sums.items()
     ]
-    whole = [1e3 * (after - before) / asked.frames for before, after in zip(begun[1], begun[-1], strict=True)]
+    whole = [1e3 * (after - before) / asked.frames for before, after in zip(*marks, strict=True)]
     in_line = [row for row in rows if not row["beside"]]
     found = {
         "family": asked.family,
