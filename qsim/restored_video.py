@@ -74,6 +74,7 @@ class RestoredInfo(VideoInfo):
     threads: Count | None = None
     device: str = ""
     look_ahead: Count = 0  # frames of the future that the method saw
+    chosen: str = ""  # by `auto`, and why; empty: the method was named
     source_sha256: Digest | None = None  # of the codes' file
     sha256: Digest | None = None  # of NAME.npy
 

@@ -57,7 +57,9 @@ def restore(asked: RestoreSettings, sums: PlaneSums, options: RestoreOptions, li
                 note(lines.pop())
             progress(done, total)
 
-        info = restore_to_file(codes, method, target, shown, force=asked.force, note=note, threads=used)
+        info = restore_to_file(
+            codes, method, target, shown, force=asked.force, note=note, threads=used, chosen=why or ""
+        )
     for line in lines:
         note(line)
     length, height, width = codes.shape

@@ -60,15 +60,15 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     path of either; integer codes [T, H, W], for which `sensor` and `exposure` [s] must be given. `method` is a
     classical method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d, path-merge), the weights that ship
     (mergenet), a .safetensors file or a folder of `quiver train`. `device` is auto, cpu or cuda; `mode` (exact,
-    streaming, windows) is for networks. `auto` takes mergenet, or a classical method where that was measured to be
-    better, and `likelihood` for codes of different exposures. `defects` [H, W] is true at hot and dead pixels, which
-    are filled from their neighbours, as are those that a stream's description states; crosstalk and afterpulses, which
-    are not inverted, warn. A network outside of what it was measured for warns; with `strict` it is a `ValueError`.
-    `planes` sums so many successive frames of one bit to a code; with `exposure` that of one plane, the photons are
-    those of the sum. Codes of a clip that is sensed now are over so many of its frames, and `ppp` is that of a code.
-    `qsim.PlaneSums` states which planes, too. Of arrays and imported streams without a map, hot pixels are looked for,
-    filled and told by a warning; `scan=False` leaves them. `ValueError` or `FileNotFoundError` where the arguments do
-    not fit together.
+    streaming, windows) is for networks. `auto` takes mergenet, or a classical method where that is better on pieces of
+    the stream, or for a short stream was measured to be better, and `likelihood` for codes of different exposures.
+    `defects` [H, W] is true at hot and dead pixels, which are filled from their neighbours, as are those that a
+    stream's description states; crosstalk and afterpulses, which are not inverted, warn. A network outside of what it
+    was measured for warns; with `strict` it is a `ValueError`. `planes` sums so many successive frames of one bit to a
+    code; with `exposure` that of one plane, the photons are those of the sum. Codes of a clip that is sensed now are
+    over so many of its frames, and `ppp` is that of a code. `qsim.PlaneSums` states which planes, too. Of arrays and
+    imported streams without a map, hot pixels are looked for, filled and told by a warning; `scan=False` leaves them.
+    `ValueError` or `FileNotFoundError` where the arguments do not fit together.
 
     A notebook shows a bar while it restores.
 

@@ -1,9 +1,10 @@
-"""Chooses the method of a stream: MergeNet, or a classical method where that was measured to be better.
+"""Chooses the method of a stream: MergeNet, or a classical method where that is better.
 
-    sensor, bits, light -> nearest measured cell in the weights file (domain.py) -> method, and one line that says why
+    sensor, bits, light -> nearest measured cell in the weights file (domain.py) -> method
+    stream -> a trial of the network and the classical methods on a few pieces (trial.py) -> method, if it differs
 
-The cells are averages over clips of several speeds. Motion does not decide: on the test clips, handing over exactly the
-clips that a classical method restores better would gain 0.02 dB in the mean (docs/results/restorer.md).
+and one line that says why. The cells are averages over clips of several speeds. A trial decides for the stream itself,
+where the stream is long enough that the trial costs little beside it, and where it is sure.
 """
 
 from __future__ import annotations
@@ -16,13 +17,23 @@ from quiver.restoration.domain import place_of
 from quiver.restoration.interface import AUTO, RestoreOptions, Restorer
 from quiver.restoration.mosaics import by_colour
 from quiver.restoration.restorers import restorer
+from quiver.restoration.trial import COST, FEWEST, affordable, tried
 
 NETWORK = "mergenet"
+RIVALS = ("qbp-bm3d", "qbp-bm3d:5")  # classical methods that are tried beside the network
 
 
-def chosen(name: str, codes: Codes, options: RestoreOptions | None = None) -> tuple[Restorer, str | None]:
-    """Return the method of this name for a stream; for `auto` the chosen one, and a line that says why."""
-    return chosen_for_all(name, [codes], options)
+def chosen(
+    name: str, codes: Codes, options: RestoreOptions | None = None, cost: float = COST
+) -> tuple[Restorer, str | None]:
+    """Return the method of this name for a stream; for `auto` the chosen one, and a line that says why.
+
+    A trial costs at most this share of the restoration.
+    """
+    method, why = chosen_for_all(name, [codes], options)
+    if name != AUTO or codes.shares is not None:
+        return method, why
+    return _tried(method, codes, options, cost, str(why))
 
 
 def chosen_for_all(
@@ -46,6 +57,26 @@ def chosen_for_all(
         raise ValueError(f"auto chooses different methods: {found}; name one of them with method=")
     best = next(iter(streams_of))
     return known.get(best) or restorer(best, options), lines[0]
+
+
+def _tried(
+    first: Restorer, codes: Codes, options: RestoreOptions | None, cost: float, why: str
+) -> tuple[Restorer, str]:
+    """Return the best method of a trial on a stream, and why: `first` where there is none, or where it is not sure."""
+    if codes.colour is not None:
+        return first, f"{why}; not tried behind colour filters"
+    names = dict.fromkeys((first.name, NETWORK, *RIVALS))
+    methods = {name: first if name == first.name else restorer(name, options) for name in names}
+    pieces = affordable(codes, list(methods.values()), cost)
+    if pieces < FEWEST:
+        return first, f"{why}; too few frames or pixels for a trial on the stream"
+    try:
+        verdict = tried(codes, list(methods.values()), pieces)
+    except ValueError:  # a mean code that does not rise with light
+        return first, f"{why}; its sensor allows no trial"
+    if verdict.best == first.name:
+        return first, f"{why}; {verdict}"
+    return methods[verdict.best], f"auto: {verdict.best}; {verdict}; {why.removeprefix('auto: ')}"
 
 
 def _best(codes: Codes, known: dict[str, Restorer], options: RestoreOptions | None) -> tuple[str, str]:

@@ -68,13 +68,15 @@ def restore_to_file(
     force: bool = True,
     note: Callable[[str], None] | None = None,
     threads: int | None = None,
+    chosen: str = "",
 ) -> RestoredInfo:
     """Restore a stream into PATH.npy (float32 photons [T, H, W]) and PATH.json; return the description.
 
     Both appear when complete, the json last. Until then the video is PATH.npy.part, written in blocks of BLOCK_FRAMES.
     An interrupted restoration of the same codes by the same method resumes after its last block. If codes or method
-    differ, it starts again and `note` receives the reason. `threads` is recorded in the description, and so is the
-    device. A failure leaves nothing behind, unless memory was exhausted: finished blocks are kept. A link is followed.
+    differ, it starts again and `note` receives the reason. `threads`, the device, and why the method was `chosen` are
+    recorded in the description. A failure leaves nothing behind, unless memory was exhausted: finished blocks are kept.
+    A link is followed.
 
     `ValueError` while another process writes PATH. `FileExistsError` if there is a result and `force` is not set, or a
     file that is not restored video.
@@ -99,6 +101,7 @@ def restore_to_file(
                 threads=threads,
                 device=method.device,
                 look_ahead=method.look_ahead,
+                chosen=chosen,
                 source_sha256=codes.source_sha256,
                 sha256=sha256(part),
             )

@@ -42,7 +42,7 @@ class RestoreSettings:
     method: Annotated[
         Text,
         setting(
-            "method, weights file or run folder; auto: what was measured to be best",
+            "method, weights file or run folder; auto: what is best on the stream",
             known=method_names,
         ),
     ] = DEFAULT_METHOD

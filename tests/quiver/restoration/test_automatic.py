@@ -95,7 +95,8 @@ def test_streams_with_one_best_method_share_it_and_others_are_named(measured):
     names = {3.25: "day", 3.0: "dusk", 26.0: "noon"}
     dim, dimmer, bright = (replace(stream(ppp), name=name) for ppp, name in names.items())
     method, line = automatic.chosen_for_all("auto", [dim, dimmer])
-    assert (method.name, line) == ("mergenet", automatic.chosen("auto", dim)[1])
+    assert method.name == "mergenet"
+    assert automatic.chosen("auto", dim)[1].startswith(line)
     with pytest.raises(ValueError, match="different methods: mergenet for day, dusk; qbp for noon; name one of them"):
         automatic.chosen_for_all("auto", [dim, bright, dimmer])
     assert automatic.chosen_for_all("moment:3", [dim, bright])[0].name == "moment:3"
