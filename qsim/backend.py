@@ -18,7 +18,8 @@ import re
 import subprocess
 import sys
 import warnings
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -29,7 +30,9 @@ from qsim.files import wording, write_bytes
 
 BACKENDS = ("cuda", "llvm", "scalar")
 VARIANTS = {"cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono", "scalar": "scalar_rgb"}
+GPU_VARIANT = VARIANTS["cuda"]
 PROBE_SECONDS = 180
+NO_DRIVER = "no NVIDIA driver on this machine"
 NO_FRAME = "no frame after"  # of a failure that may pass
 NO_LIBRARY = "cannot open shared object file"  # as well: a library that an LLVM needs can be installed beside it
 OPTIX = "OptiX is missing or too old"  # of a failure that stays
@@ -58,6 +61,19 @@ scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "light": 
 import numpy as np
 mean = float(np.mean(np.array(mi.render(scene, spp=4))))
 print("rendered" if mean > 0 else f"rendered a mean of {mean}")
+"""
+
+# The same of the GPU's own denoiser: a noisy grey picture of 1, whose mean must stay.
+_DENOISER_PROBE = """
+import sys
+import mitsuba as mi
+mi.set_variant(sys.argv[1])
+import numpy as np
+noisy = np.random.default_rng(0).uniform(0.5, 1.5, (32, 48, 3)).astype(np.float32)
+denoiser = mi.OptixDenoiser(input_size=mi.ScalarVector2u(48, 32), albedo=True)
+cleaned = np.array(denoiser(mi.TensorXf(noisy), albedo=mi.TensorXf(np.ones_like(noisy))))
+right = cleaned.shape == noisy.shape and abs(cleaned.mean() - 1) < 0.1 and cleaned.std() < noisy.std()
+print("rendered" if right else f"denoised to {cleaned.mean()} with {cleaned.std()} left")
 """
 
 
@@ -184,22 +200,37 @@ decided = lru_cache(decide)
 
 def probe_cuda() -> Probe:
     """Test CUDA if there is a driver; its version is part of the cache key."""
+    stamp = _driver()
+    return cached_probe(VARIANTS["cuda"], None, stamp) if stamp else Probe("cuda", None, False, NO_DRIVER)
+
+
+@lru_cache
+def gpu_denoises() -> bool:
+    """Return whether OptiX's denoiser works here, tested in a child process: its failure may end the process."""
+    stamp = _driver()
+    return bool(stamp) and cached_probe(GPU_VARIANT, None, f"{stamp}, denoiser", run_denoiser_probe).works
+
+
+def _driver() -> str:
+    """Return what identifies driver and visible GPUs; empty without a driver."""
     driver = Path("/proc/driver/nvidia/version")
     if not (driver.exists() or ctypes.util.find_library("cuda") or ctypes.util.find_library("nvcuda")):
-        return Probe("cuda", None, False, "no NVIDIA driver on this machine")
+        return ""
     stamp = driver.read_text().splitlines()[0] if driver.exists() else "driver"
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    return cached_probe(VARIANTS["cuda"], None, stamp if visible is None else f"{stamp}, visible: {visible}")
+    return stamp if visible is None else f"{stamp}, visible: {visible}"
 
 
-def cached_probe(variant: str, library: str | None, stamp: str = "") -> Probe:
-    """Return the stored result of an earlier test, or test in a child process."""
+def cached_probe(
+    variant: str, library: str | None, stamp: str = "", run: Callable[[str, str | None], Probe] | None = None
+) -> Probe:
+    """Return the stored result of an earlier test, or test in a child process; `run` None is `run_probe`."""
     modified = os.stat(library).st_mtime_ns if library else 0
     software = [version("mitsuba"), version("drjit"), sys.version.split()[0]]
     key = json.dumps([variant, os.path.realpath(library) if library else None, modified, stamp, *software])
     answers = _read_cache()
     if key not in answers:
-        probe = run_probe(variant, library)
+        probe = (run or run_probe)(variant, library)
         if not lasts(probe):
             return probe
         answers = _read_cache() | {key: asdict(probe)}
@@ -216,10 +247,17 @@ def lasts(probe: Probe) -> bool:
     return probe.works or not (passes or (on_gpu(probe.backend) and OPTIX not in probe.detail))
 
 
-def run_probe(variant: str, library: str | None) -> Probe:
+def run_denoiser_probe(variant: str, library: str | None) -> Probe:
+    """Test the GPU's own denoiser in a child process."""
+    probe = run_probe(variant, library, _DENOISER_PROBE)
+    return replace(probe, detail=f"{probe.detail}, denoiser")
+
+
+def run_probe(variant: str, library: str | None, script: str = _PROBE) -> Probe:
+    """Run a script that tests a candidate in a child process; it prints `rendered` where that works."""
     backend = variant.split("_")[0]
     needed = llvm.companions(library) if library else []
-    command = [sys.executable, "-W", "ignore", "-c", _PROBE, variant, library or "", str(llvm.OLDEST), *needed]
+    command = [sys.executable, "-W", "ignore", "-c", script, variant, library or "", str(llvm.OLDEST), *needed]
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False)
     except subprocess.TimeoutExpired:

@@ -85,7 +85,7 @@ class Work:
     dimmed_error: NotNegative = 0.0  # standard error of that share
     findings: tuple[Finding, ...] = ()
     neighbours: Count = 0  # frames on each side whose samples are carried into a frame (reuse/); 0: each frame alone
-    quality: Text = "high"  # of the denoiser: high, balanced or fast
+    quality: Text = "high"  # of the denoiser: high, balanced or fast; optix: that of a GPU
     planes: Whole = 1  # successive frames, from 0 on, that share the noise of a code (planes.py); 1: each frame alone
     codes: tuple[Whole, ...] = ()  # frames in a code of each kind, whose middle frames are sharp/; of `planes` > 1
     sharp_samples: Count = 0  # per pixel, of those sharp frames

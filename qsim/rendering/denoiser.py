@@ -29,9 +29,13 @@ from typing import TypeVar
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.backend import gpu_denoises, on_gpu
 from qsim.clip.clamped_error import Clamp, clamped_squares
 from qsim.lazy_array import Crop
+from qsim.rendering import optix_denoiser
 
+QUALITIES = ("high", "balanced", "fast")  # of Open Image Denoise, best first
+OPTIX = "optix"  # in place of a quality: the denoiser of a GPU
 AROUND = 33  # px, side of the square around a pixel in which errors are compared
 Kind = TypeVar("Kind", bound="Mixture")
 KEPT = 0.25  # of a frame's error: the largest shift of its mean towards that of the raw halves
@@ -42,12 +46,22 @@ def available() -> bool:
     return find_spec("pyoidn") is not None
 
 
+def kinds(variant: str) -> tuple[str, ...]:
+    """Return the denoisers that are tried for frames of a Mitsuba variant, as `Budget.quality` names them."""
+    return (*QUALITIES, OPTIX) if on_gpu(variant) and gpu_denoises() else QUALITIES
+
+
+def wording(kind: str) -> str:
+    """Return the name of a denoiser in sentences."""
+    return "OptiX" if kind == OPTIX else f"{kind} quality"
+
+
 def denoised(noisy: Array, albedo: Array, normal: Array, quality: str = "high") -> Array:
     """Return a picture [H, W] or [3, H, W] without its pixel noise, float32.
 
     Albedo has the shape of the picture, in 0..1, `normal` is [H, W, 3]; both are treated as free of noise. `quality` is
-    "high", "balanced" or "fast": networks that take about 1, 0.4 and 0.2 of the time.
-    `ValueError` if the denoiser is not installed.
+    "high", "balanced" or "fast": networks that take about 1, 0.4 and 0.2 of the time. "optix" is OptiX's denoiser on a
+    GPU, which sees no normals. `ValueError` if the denoiser is not installed.
     """
     if not available():
         raise ValueError("denoising requires Open Image Denoise, which is missing: pip install pyoidn")
@@ -56,7 +70,10 @@ def denoised(noisy: Array, albedo: Array, normal: Array, quality: str = "high") 
     colour = _three(noisy)
     matt = _three(np.clip(albedo, 0, 1))
     normal = normal.astype(np.float32)
-    cleaned = pyoidn.denoise(colour, albedo=matt, normal=normal, hdr=True, clean_aux=True, quality=quality)
+    if quality == OPTIX:
+        cleaned = optix_denoiser.denoised(colour, matt)
+    else:
+        cleaned = pyoidn.denoise(colour, albedo=matt, normal=normal, hdr=True, clean_aux=True, quality=quality)
     return np.maximum(cleaned[..., 0] if noisy.ndim == 2 else np.moveaxis(cleaned, -1, 0), 0)
 
 

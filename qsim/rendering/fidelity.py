@@ -28,6 +28,7 @@ from qsim.optics.camera import Camera
 from qsim.optics.diffraction import diffraction_line
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.rendering.budget import LIMIT, Allowed, Budget, Finding, blur_error, grid_samples, plane_grid
+from qsim.rendering.denoiser import wording
 from qsim.rendering.pilot import COUNTS, OF_PLANES, Pilot, Trials, denoised_samples, rests
 from qsim.rendering.planes import most_planes
 from qsim.rendering.reuse.sharing import Need, Sharing, shared_samples
@@ -215,7 +216,7 @@ def _planes(pilot: Pilot, sharp: Budget, work: _Work, denoise: bool | None) -> B
         fewer, _ = denoised_samples(pilot, trial, work.bounces, strict, work.share, chosen.samples, denoise, expected)
         if fewer is not None:
             chosen = Sharing(fewer[0], 0, fewer[1])
-            how = f"their mean denoised, {fewer[1]} quality; {raw} without"
+            how = f"their mean denoised, {wording(fewer[1])}; {raw} without"
     each = (chosen.samples - sharp.samples) // (count - 1)
     # The mean of a code may be right while its planes are not: a binary
     # plane bends, and noise between planes lowers its counts.

@@ -20,7 +20,7 @@ from qsim.clip.clamped_error import Errors
 from qsim.colour import bright_end
 from qsim.optics.camera import Camera, Pose
 from qsim.rendering.budget import DENOISE_COST, Allowed, Budget, Finding, grid_samples, instants, light_windows
-from qsim.rendering.denoiser import AROUND, available, cleaned_mean
+from qsim.rendering.denoiser import AROUND, available, cleaned_mean, kinds, wording
 from qsim.rendering.renderer import Renderer
 from qsim.scene import Scene, Still
 
@@ -230,7 +230,8 @@ def denoised_samples(
         return None, Finding("denoiser", "off", reason)
     cheap = Finding("denoiser", "off", f"{raw} raw samples cost no more")
     numbers = [count * each for each in trials_of.counts]
-    least = {n: DENOISE_COST["fast" if n <= MOST_FASTER * count else "high"] for n in numbers}
+    names = {n: kinds(renderer.variant) if n <= MOST_FASTER * count else ("high",) for n in (FEWEST * count, *numbers)}
+    least = {n: min(map(DENOISE_COST.__getitem__, names[n])) for n in numbers}
     tried = [n for n, cost in least.items() if wanted or n + cost < raw]
     if not tried:
         return None, cheap
@@ -245,7 +246,7 @@ def denoised_samples(
         halves = [window.halves(times, Budget(samples, bounces), key) for window in parts]
         found = {}
         noisy = _root_mean([Errors.of_halves(pair, allowed.white).plain for pair in halves])
-        for quality in DENOISE_COST if samples <= MOST_FASTER * count else ["high"]:
+        for quality in names[samples]:
             each = zip(halves, surfaces, strict=True)
             mixed = [cleaned_mean(pair, *seen, allowed.white, quality) for pair, seen in each]
             at_white = _root_mean([one.error_at(allowed.white, CAREFUL) for one in mixed])
@@ -260,11 +261,11 @@ def denoised_samples(
         # The error falls with the samples; more trials than the first that suffices only cost time.
         if trials[-1]["high"] <= share:
             break
-    faster = min(trials[0].get(quality, math.inf) for quality in ("balanced", "fast"))
+    faster = min((error for quality, error in trials[0].items() if quality != "high"), default=math.inf)
     if tried[0] > FEWEST * count and faster * RISE <= share:
         tried = [FEWEST * count, *tried]
         trials = [trial(FEWEST * count), *trials]
-    errors = {quality: [one[quality] for one in trials if quality in one] for quality in DENOISE_COST}
+    errors = {quality: [one[quality] for one in trials if quality in one] for quality in kinds(renderer.variant)}
     size = f"tried in {'' if len(parts) == 1 else 'four windows of '}frame {t}"
     options = _enough(tried, errors, share, trials_of)
     if wanted and not options:  # asked for: as many samples as there may be
@@ -273,7 +274,7 @@ def denoised_samples(
     chosen = min(options, key=lambda option: option[0] + DENOISE_COST[option[1]], default=None)
     if chosen is None or (not wanted and chosen[0] + DENOISE_COST[chosen[1]] >= raw):
         return None, cheap
-    return chosen, Finding("denoiser", f"on, {chosen[1]} quality", size)
+    return chosen, Finding("denoiser", f"on, {wording(chosen[1])}", size)
 
 
 def _cannot_denoise(renderer: Renderer, wanted: bool | None) -> str:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.backend import RenderEngine
+from qsim.backend import RenderEngine, on_gpu
 from qsim.clip.clamped_error import HalvesNoise, StatedError, error_at, frame_errors, rms, white_in
 from qsim.device_lock import one_thread_at_a_time
 from qsim.host import own_numbers
@@ -33,7 +33,7 @@ from qsim.optics.radiometry import check_crop
 from qsim.rendering import ground_truth
 from qsim.rendering.budget import Budget, as_bright, blur_left, grid_samples, instants, light_windows
 from qsim.rendering.camera_rays import CameraRays, Film
-from qsim.rendering.denoiser import Mixture, cleaned_mean
+from qsim.rendering.denoiser import OPTIX, Mixture, cleaned_mean
 from qsim.rendering.engine import activate, in_colour, in_own_variant, select
 from qsim.rendering.mitsuba_scene import Stage, film_pass
 from qsim.rendering.planes import Planes, together
@@ -119,6 +119,12 @@ class Renderer:
         self.seed = seed
         self.budget = budget or Budget()
         self.engine = (engine or select()) if scene.bands is None else in_colour(engine or select())
+        asked = (self.budget.quality if self.budget.denoise else "", self.budget.sharp_quality)
+        if OPTIX in asked and not on_gpu(self.engine.backend):
+            raise ValueError(
+                f"Budget.quality: {OPTIX} is the denoiser of a GPU, and the renderer is {self.engine.backend}; "
+                "choose high, balanced or fast"
+            )
         activate(self.engine)
         import mitsuba as mi
 

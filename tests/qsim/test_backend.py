@@ -137,6 +137,26 @@ def test_hidden_gpus_have_their_own_probe(monkeypatch):
     assert len(set(stamps)) == 4
 
 
+def test_the_denoiser_of_a_gpu_has_a_probe_of_its_own(monkeypatch):
+    """A GPU that renders may lack the file of its denoiser. Nothing of it runs here."""
+    scripts = []
+
+    def run(command, **options):
+        scripts.append(command[command.index("-c") + 1])
+        return subprocess.CompletedProcess([], int("OptixDenoiser" in scripts[-1]), "rendered\n", "no denoiser")
+
+    monkeypatch.setattr(backend.ctypes.util, "find_library", lambda name: "libcuda.so.1")
+    monkeypatch.setattr(backend.subprocess, "run", run)
+    backend.gpu_denoises.cache_clear()
+    try:
+        assert backend.probe_cuda().works
+        assert not backend.gpu_denoises()
+    finally:
+        backend.gpu_denoises.cache_clear()
+    assert len(set(scripts)) == 2
+    compile(scripts[1], "probe", "exec")
+
+
 def test_a_file_that_is_no_library_fails_its_probe(tmp_path):
     library = tmp_path / "libLLVM.so.22.1"
     library.write_bytes(b"not a library")

@@ -20,7 +20,7 @@ from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import Errors
 from qsim.rendering.budget import DENOISE_COST, Allowed, Budget, Finding, grid_samples
-from qsim.rendering.denoiser import available
+from qsim.rendering.denoiser import available, kinds, wording
 from qsim.rendering.pilot import CAREFUL, COUNTS, LUCK, STAGE, Pilot, needed_samples, windows
 from qsim.rendering.reuse.carrying import REACH, unshared
 from qsim.rendering.reuse.choice import best_of, reused_mean
@@ -54,7 +54,7 @@ class Sharing:
     @property
     def about_denoiser(self) -> str:
         """Whether and how pictures are denoised, as text."""
-        return f"on, {self.denoise} quality" if self.denoise else "off"
+        return f"on, {wording(self.denoise)}" if self.denoise else "off"
 
     def cost(self, pixels: int) -> float:
         """Return the cost of a frame of so many pixels, in samples per pixel."""
@@ -99,16 +99,17 @@ def shared_samples(
         return alone, Finding(NAME, ALONE, f"not with {reason}")
     camera = renderer.scene.camera
     pixels = camera.height * camera.width
-    kinds = [kind for kind in ("", *DENOISE_COST) if denoise in (None, bool(kind)) and (available() or not kind)]
+    names = ("", *kinds(renderer.variant))
+    tried = [kind for kind in names if denoise in (None, bool(kind)) and (available() or not kind)]
     clip = need.frames * pixels * alone.cost(pixels)
     trials: list[Trial] = []
     for samples in COUNTS[:MOST_TRIED]:
         # The most that sharing could save: as if so few samples and one neighbour were enough.
-        saved = clip - need.frames * pixels * Sharing(samples, 1, kinds[0]).cost(pixels)
-        cost = _trial_cost(samples, pilot, kinds)
+        saved = clip - need.frames * pixels * Sharing(samples, 1, tried[0]).cost(pixels)
+        cost = _trial_cost(samples, pilot, tried)
         if saved <= cost or not most_neighbours(samples, pixels) or (wanted is None and cost > MOST_TRIAL * clip):
             break
-        trials.append(Trial.of(pilot, need, samples, kinds))
+        trials.append(Trial.of(pilot, need, samples, tried))
         if min(map(max, trials[-1].found.values())) <= 1:
             break
     best = _cheapest(trials, alone, pixels)

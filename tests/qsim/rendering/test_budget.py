@@ -83,5 +83,5 @@ def test_samples_are_shared_among_halves_and_instants():
 
 
 def test_a_quality_of_the_denoiser_that_does_not_exist_is_refused():
-    with pytest.raises(ValueError, match=r"Budget\.quality: high, balanced, fast; got 'best'"):
+    with pytest.raises(ValueError, match=r"Budget\.quality: high, balanced, fast, optix; got 'best'"):
         Budget(quality="best")

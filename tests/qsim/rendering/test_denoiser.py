@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from small_scenes import CAMERA, plate, renderer
 
-from qsim.rendering import denoiser
+from qsim.backend import GPU_VARIANT, VARIANTS
+from qsim.rendering import denoiser, optix_denoiser
 from qsim.rendering.budget import Budget
-from qsim.rendering.denoiser import available, mixture
+from qsim.rendering.denoiser import available, cleaned_mean, mixture
 from qsim.scene import Spin, SunSky
 
 
@@ -61,6 +62,34 @@ def test_each_part_of_a_picture_is_mixed_by_its_own_errors():
     assert share[:, :120].min() > 0.6
     assert share[:, :120].mean() > 0.95
     assert share[:, 180:].max() < 0.05
+
+
+def test_only_a_gpu_whose_denoiser_works_has_one_more_kind(monkeypatch):
+    gpu = GPU_VARIANT.replace("_mono", "_rgb")
+    for works, kinds in ((True, (*denoiser.QUALITIES, denoiser.OPTIX)), (False, denoiser.QUALITIES)):
+        monkeypatch.setattr(denoiser, "gpu_denoises", lambda works=works: works)
+        assert denoiser.kinds(gpu) == kinds
+        assert denoiser.kinds(VARIANTS["llvm"]) == denoiser.QUALITIES
+
+
+@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install pyoidn")
+@pytest.mark.parametrize("added", [0.0, 0.1, 1.0])
+def test_the_error_of_the_denoiser_of_a_gpu_contains_its_bias(monkeypatch, added):
+    """A stand-in returns the truth with stripes of 8 px added, which keep the mean light; noise of 0.5 in each half."""
+    rng = np.random.default_rng(7)
+    truth = 2 + rng.random((120, 168))
+    halves = truth + 0.5 * rng.standard_normal((2, *truth.shape))
+    stripes = added * (-1.0) ** (np.arange(truth.shape[1]) // 8)
+    monkeypatch.setattr(optix_denoiser, "denoised", lambda colour, albedo: np.stack([truth + stripes] * 3, axis=-1))
+    mixed = cleaned_mean(halves, np.ones_like(truth), np.zeros((*truth.shape, 3)), math.inf, denoiser.OPTIX)
+    distance = math.sqrt(np.mean((mixed.picture - truth) ** 2))
+    assert max(distance, 0.1 * 0.5 / math.sqrt(2)) == pytest.approx(mixed.error, rel=0.15)
+    assert (distance < 0.05) == (added == 0)
+
+
+def test_another_engine_refuses_the_denoiser_of_a_gpu():
+    with pytest.raises(ValueError, match="optix is the denoiser of a GPU"):
+        renderer(plate(None), budget=Budget(8, 2, denoise=True, quality=denoiser.OPTIX))
 
 
 def test_a_filter_without_effect_lowers_no_error():

@@ -14,7 +14,7 @@ from qsim.clip.clamped_error import Errors, error_at, white_in
 from qsim.colour import psnr
 from qsim.rendering import pilot
 from qsim.rendering.budget import Allowed
-from qsim.rendering.denoiser import available
+from qsim.rendering.denoiser import OPTIX, available
 from qsim.rendering.fidelity import choose_budget
 from qsim.rendering.renderer import Renderer
 from qsim.scene import Body, Diffuse, Glow, Oscillation, SunSky, Texture
@@ -84,7 +84,31 @@ def test_a_denoised_trial_with_far_less_noise_than_the_pilots_is_rejected():
 )
 def test_the_cheapest_quality_of_the_denoiser_that_reaches_the_error_is_chosen(monkeypatch, over, chosen):
     """Errors of 1, 1.1 and 1.25 times `over`, falling by the root of the samples from 8 on, where 1 is allowed."""
-    factors = {"high": 1.0, "balanced": 1.1, "fast": 1.25}
+    found, about = chosen_of(monkeypatch, over, {"high": 1.0, "balanced": 1.1, "fast": 1.25})
+    assert found == chosen
+    assert (f"{chosen[1]} quality" if chosen else "off") in about.chosen
+
+
+@pytest.mark.parametrize(
+    ("over", "factor", "chosen"),
+    [
+        (0.7, 1.0, (4, OPTIX)),  # 4 + 5: as good as high, whose 4 + 15 is more than the 8 + 5 of fast
+        (1.7, 1.0, (24, OPTIX)),  # 24 + 5 in place of 24 + 15
+        (1.7, 1.3, (24, "high")),  # worse than fast: what is chosen without it
+        (0.7, 9.0, (8, "fast")),  # far too wrong
+        (7.0, 1.0, None),  # more than raw samples
+    ],
+)
+def test_the_denoiser_of_a_gpu_is_one_more_candidate(monkeypatch, over, factor, chosen):
+    """Its errors are `factor` times those of high, at the cost of fast; nothing of it runs here."""
+    monkeypatch.setattr(pilot, "kinds", lambda variant: ("high", "balanced", "fast", OPTIX))
+    found, about = chosen_of(monkeypatch, over, {"high": 1.0, "balanced": 1.1, "fast": 1.25, OPTIX: factor})
+    assert found == chosen
+    assert ("OptiX" in about.chosen) == (chosen is not None and chosen[1] == OPTIX)
+
+
+def chosen_of(monkeypatch, over, factors):
+    """Return what is chosen where the denoisers have these errors; 1 is allowed."""
 
     def cleaned(halves, _albedo, _normal, _white, quality):
         error = over * factors[quality] * math.sqrt(8 / halves[0, 0, 0])
@@ -96,8 +120,6 @@ def test_the_cheapest_quality_of_the_denoiser_that_reaches_the_error_is_chosen(m
     monkeypatch.setattr(Renderer, "halves", lambda _, times, budget, key: np.full((2, 4, 4), float(budget.samples)))
     made = plate(None, camera=replace(CAMERA, height=48, width=64))
     loaded = pilot.Pilot(Renderer(made), np.zeros((1, 48, 64)), 0, (0,))
-    found, about = pilot.denoised_samples(
+    return pilot.denoised_samples(
         loaded, pilot.Trials(1), 2, Allowed(10.0, 1.0), 1.0, 300, None, lambda samples: Errors(0.0, 0.0)
     )
-    assert found == chosen
-    assert (f"{chosen[1]} quality" if chosen else "off") in about.chosen
