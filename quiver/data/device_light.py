@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,9 +20,13 @@ from torch import Tensor
 
 from qsim.optics.camera import Camera
 from qsim.optics.radiometry import illumination, off_axis_cosines, photon_energy
+from qsim.sensor.defects.fixed_pattern import lit
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
+from qsim.streams.simulation import Draw
 from quiver.data.clips import has_sharp, peak_of
+from quiver.data.illumination import Illumination
+from quiver.data.window_noise import pixel_array
 from quiver.data.windows import Windows
 from quiver.device import moved, pinned
 
@@ -31,7 +35,7 @@ ERROR = 1e-13  # of a cubic, at most
 FAINT = 1e-13  # chance of a code below the top one that the brightest light of the cubics leaves
 WIDEST = 7  # bits of codes, by memory: 127 steps take 133 MB
 FINEST = 1024  # parts of a pixel at which an axis may lie
-INTEGERS = 8  # of a clip and noise: places in the memories of light, gains and laws; sizes
+INTEGERS = 12  # of a clip and noise: places in the memories of light, gains, laws and pixels; sizes, origin
 NUMBERS = 8  # of a clip and noise: factors of photons, white, peak
 
 
@@ -110,6 +114,24 @@ def _fall_off(clip: Clip, camera: Camera, scale: float) -> Array:
     return illumination(height, width, *axis, camera.focal_pixels, camera.lens, camera.vignetting)
 
 
+def _pixels_of(clip: Clip, noise: Illumination, draw: Draw) -> tuple[Sensor, Array | None]:
+    """Return the sensor that draws codes of exposures, and of pixels with maps two numbers each, float64 [H W, 2].
+
+    They are the efficiency over the sensor's, and photons that would cause the dark events. Dead pixels are filled.
+    """
+    if noise.defects is None:
+        return draw.plane, None
+    array = pixel_array(noise.defects, draw.plane, clip.shape[1:], draw.origin)
+    maps = array.maps
+    # The factors of `lit`: light without a map is multiplied by 1, and 0 is added.
+    sensor, dark = lit(array.sensor, np.zeros(clip.shape[1:]), clip.exposure, replace(maps, gain=None))
+    found = np.ones((*clip.shape[1:], 2))
+    if maps.gain is not None:
+        found[..., 0] = maps.gain
+    found[..., 1] = dark
+    return sensor, found.reshape(-1, 2)
+
+
 # ---- What a device holds
 
 
@@ -151,12 +173,16 @@ class HeldClips:
         self.light = torch.empty(sum(sizes), dtype=torch.float16, device=device)
         self.gains = torch.ones(1, dtype=torch.float64, device=device)  # the first one is that of clips without a map
         self.cubics = torch.empty((0, 4), dtype=torch.float64, device=device)
+        self.pixels = torch.ones((1, 2), dtype=torch.float64, device=device)  # the first one is that of no defects
+        self.pixels[0, 1] = 0
+        self.defects = any(noise.defects is not None for noise in windows.noise.noises)
         self.integers = torch.zeros((rows, INTEGERS), dtype=torch.int64, device=device)
         self.numbers = torch.ones((rows, NUMBERS), dtype=torch.float64, device=device)
         self.sharp = False  # whether a clip has sharp frames
         self.bits = 1  # of codes, at most
         self._gains: dict[Any, int] = {}
         self._laws: dict[tuple[Sensor, float], tuple[int, _Law]] = {}
+        self._arrays: dict[Any, int] = {}
 
     def hold(self, slot: int, clip: Clip, light: Tensor) -> None:
         """Put a clip, whose light is that of `light_of`, into a slot; what was there is lost."""
@@ -172,8 +198,11 @@ class HeldClips:
         numbers = []
         for noise in noises:
             draw = noise.draw(clip)
-            law_at, law = self._place_of_law(draw.sensor, clip.exposure)
-            integers.append((first, sharp, height * width, width, place, int(gain.map is not None), law_at, law.steps))
+            drawing, pixels = _pixels_of(clip, noise, draw)
+            law_at, law = self._place_of_law(drawing, clip.exposure)
+            array = self._place_of_pixels((noise.defects, draw.plane, *clip.shape[1:], draw.origin), pixels)
+            light_at = first, sharp, height * width, width, place, int(gain.map is not None)
+            integers.append((*light_at, law_at, law.steps, array, int(pixels is not None), *draw.origin))
             white = draw.sensor.white(clip.exposure)
             forced = self.windows.settings.force_exposure
             peak = white if forced else peak_of(draw.level.ppp)
@@ -187,7 +216,7 @@ class HeldClips:
     @property
     def bytes(self) -> int:
         """The memory that light, gains and laws take."""
-        return self.light.nbytes + self.gains.nbytes + self.cubics.nbytes
+        return sum(held.nbytes for held in (self.light, self.gains, self.cubics, self.pixels))
 
     def _sent(self, numbers: Tensor) -> Tensor:
         """Return numbers on the device, without waiting for it."""
@@ -202,6 +231,15 @@ class HeldClips:
             self.gains = torch.cat((self.gains, self._sent(torch.from_numpy(gain.map.ravel().copy()))))
             self._check_memory()
         return self._gains[key]
+
+    def _place_of_pixels(self, key: Any, pixels: Array | None) -> int:
+        if pixels is None:
+            return 0
+        if key not in self._arrays:
+            self._arrays[key] = len(self.pixels)
+            self.pixels = torch.cat((self.pixels, self._sent(torch.from_numpy(pixels))))
+            self._check_memory()
+        return self._arrays[key]
 
     def _place_of_law(self, sensor: Sensor, exposure: float) -> tuple[int, _Law]:
         if (sensor, exposure) not in self._laws:

@@ -22,11 +22,15 @@ from numpy import ndarray as Array
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from qsim.sensor.defects.defect_table import Defects
 from qsim.streams.exposures import Timing
 from quiver.data import numpy_sums
+from quiver.data.device_filling import FILL, Fills, fill_of
 from quiver.data.device_light import CELLS, HeldClips, Unfit, light_of, size_of
-from quiver.data.device_words import uniform, words
+from quiver.data.device_words import uniform, words, words_at
+from quiver.data.illumination import stored_defects
 from quiver.data.mosaic_windows import TURNS, turned_frame
+from quiver.data.sensor_of_window import SENSORS, TOP, seen_by, stated
 from quiver.data.windows import DARKEST, STAY, Windows
 from quiver.device import moved
 
@@ -40,13 +44,15 @@ SPARE = 4  # slots beside those of a pool: of clips that a batch needs already, 
 class Places(Dataset[dict[str, Any]]):
     """Where windows lie, and under which key: what a device needs to draw them. A `torch` data set, as `Windows`.
 
-    An item holds `place`, int64 [10], which `DeviceWindows` reads, `sample` and `key` as of `Windows`.
+    An item holds `place`, int64 [10], which `DeviceWindows` reads, `sample` and `key` as of `Windows`. Where some noise
+    has defects it also holds how they are filled, and where `seen_by` prepares the windows, what that returns.
     """
 
     def __init__(self, windows: Windows, slots: int) -> None:
         """Give places of windows whose clips lie in so many slots."""
         self.windows = windows
         self.slots = slots
+        self.defects = any(noise.defects is not None for noise in windows.noise.noises)
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -59,7 +65,14 @@ class Places(Dataset[dict[str, Any]]):
         key = place.key.philox_key
         numbers = (row, place.start, place.y, place.x, *place.drift, place.turn, int(place.backwards))
         place_of_window = torch.tensor((*numbers, key >> 32, key & 0xFFFFFFFF))
-        return {"place": place_of_window, "sample": n, "key": windows.text_of(place)}
+        found = {"place": place_of_window, "sample": n, "key": windows.text_of(place)}
+        if self.defects:
+            bad = windows.bad_of(place)
+            none = np.zeros((windows.settings.crop, windows.settings.crop), bool)
+            found[FILL] = fill_of(none if bad is None else bad, windows.seen_by(place)[0])
+        if windows.prepare is seen_by:
+            found |= stated(*windows.seen_by(place))
+        return found
 
 
 # ---- Windows
@@ -68,15 +81,18 @@ class Places(Dataset[dict[str, Any]]):
 def why_not(windows: Windows) -> str | None:
     """Return why no device draws these windows; None where one can, as far as settings and noises tell."""
     settings = windows.settings
-    if windows.prepare is not None:
+    if windows.prepare not in (None, seen_by):
         return "the network takes more inputs, which are computed where windows are drawn"
     if settings.still:
         return "they have copies at rest"
     if windows.filters is not None:
         return "they have colour filters"
     for noise in windows.noise.noises:
-        if noise.defects is not None or noise.timing != Timing() or noise.sensing.diffraction:
-            return f"{noise.label}: has defects, diffraction, or codes of several or late exposures"
+        if noise.timing != Timing() or noise.sensing.diffraction:
+            return f"{noise.label}: has diffraction, or codes of several or late exposures"
+        found = Defects() if noise.defects is None else stored_defects(noise.defects)
+        if found.disturbed or found.read_out:
+            return f"{noise.label}: has crosstalk, afterpulses, or pixels with an offset or read noise of their own"
     return None
 
 
@@ -109,6 +125,8 @@ class DeviceWindows:
         grid: Array = np.indices(self.shape[1:])
         turned: Array = np.stack([turned_frame(grid, turn) for turn in TURNS])
         self.turned = torch.from_numpy(np.ascontiguousarray(turned)).to(device)  # [8, 2, side, side]
+        # int64 [8, side side]: the pixel of a turned window for each one of the window that is not turned
+        self.places_of_turns = (self.turned[:, 0] * self.shape[2] + self.turned[:, 1]).flatten(1).argsort(dim=1)
 
     def _turn_over(self, samples: Tensor) -> None:
         """Hold the clips that samples [B] may draw, and read the next ones meanwhile.
@@ -137,14 +155,19 @@ class DeviceWindows:
         """Return the windows of a batch of `places`, with what `Windows` states of them, on the device."""
         if self.windows.settings.pool is not None:
             self._turn_over(batch["sample"])
-        found = self.drawn(moved(batch["place"], self.device))
-        return found | {"sample": batch["sample"], "key": batch["key"]}
+        fills = Fills.of(batch[FILL], self.device) if FILL in batch else None
+        found = self.drawn(moved(batch["place"], self.device), fills)
+        return found | {name: batch[name] for name in ("sample", "key", SENSORS, TOP) if name in batch}
 
-    def drawn(self, place: Tensor) -> dict[str, Tensor]:
-        """Return codes, target, white, peak and ppp of windows at places int64 [B, 10] on the device."""
+    def drawn(self, place: Tensor, fills: Fills | None = None) -> dict[str, Tensor]:
+        """Return codes, target, white, peak and ppp of windows at places int64 [B, 10] on the device.
+
+        `fills` are of their defective pixels.
+        """
         held = self.held
         row, start, y, x, dy, dx, turn, backwards, high, low = place.unbind(1)
-        first, sharp, frame, width, gain, mapped, law, steps = held.integers.index_select(0, row).unbind(1)
+        *light_at, law, steps, array, arrayed, top_of_clip, left_of_clip = held.integers.index_select(0, row).unbind(1)
+        first, sharp, frame, width, gain, mapped = light_at
         # float64 [B, 1, 1, 1]
         scale, rate, factor, cells, white, peak, ceiling, wanted = (
             each[:, None, None, None] for each in held.numbers.index_select(0, row).unbind(1)
@@ -167,7 +190,21 @@ class DeviceWindows:
         if self.windows.settings.force_exposure:
             own = _all(numpy_sums.mean(exposed.flatten(1))).clamp(min=DARKEST)
             exposed = exposed * torch.where(wanted.isnan(), 1.0, wanted / own)
-        codes = self._codes(exposed, cells, law, steps, words(high, low, self.shape, redraws=2))
+        if held.defects:
+            # Defects are those of a place in the full frame, and so are the random numbers of its pixels.
+            fixed = (y[:, None, None] + rows) * width[:, None, None] + x[:, None, None] + columns
+            numbers = held.pixels[array[:, None, None] + fixed * arrayed[:, None, None]]  # [B, side, side, 2]
+            brighter, dark = (each[:, None] for each in numbers.unbind(-1))
+            corner = top_of_clip + y, left_of_clip + x
+            drawn_at = self._counters(arrayed, start * (1 - backwards), corner, (rows, columns))
+            redraw = torch.arange(2, device=self.device)[:, None, None, None]
+            upper, lower = (half[:, None, None, None, None] for half in (high, low))
+            drawn = words_at(upper, lower, *drawn_at, redraw)
+            codes = self._codes(exposed * brighter + dark, cells, law, steps, drawn)
+        else:
+            codes = self._codes(exposed, cells, law, steps, words(high, low, self.shape, redraws=2))
+        if fills is not None:
+            codes = fills.applied(codes, self.places_of_turns.index_select(0, turn))
         return {
             "codes": (codes.float() / _all(steps).float())[:, :, None],
             "target": torch.minimum(clean / white, ceiling).float()[:, :, None],
@@ -175,6 +212,20 @@ class DeviceWindows:
             "peak": peak.flatten(),
             "ppp": numpy_sums.mean(exposed.flatten(1)),
         }
+
+    def _counters(
+        self, arrayed: Tensor, number: Tensor, corner: tuple[Tensor, Tensor], inside: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return frame, row and column [B, 1, T or 1, side, side] of the random numbers of all pixels.
+
+        Windows with defects (`arrayed`) have those of the full frame, from frame `number` and their `corner` on and not
+        turned. Others have those of the turned window, from 0 on. `inside` are rows and columns before turns.
+        """
+        with_defects = arrayed[:, None, None] == 1
+        frame = torch.arange(self.shape[0], device=self.device) + (number * arrayed)[:, None]
+        places = zip(corner, inside, self.turned[0], strict=True)
+        y, x = (torch.where(with_defects, first[:, None, None] + own, plain) for first, own, plain in places)
+        return frame[:, None, :, None, None], y[:, None, None], x[:, None, None]
 
     def _codes(self, photons: Tensor, cells: Tensor, law: Tensor, steps: Tensor, drawn: Tensor) -> Tensor:
         """Return codes int64 [B, T, h, w]: how many steps lie at or below the number of each pixel."""

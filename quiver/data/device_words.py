@@ -21,11 +21,35 @@ def words(high: Tensor, low: Tensor, shape: tuple[int, int, int], redraws: int =
     """
     frames, height, width = shape
     device = high.device
-    c0 = torch.arange((width + 3) // 4, device=device)
-    c1 = torch.arange(height, device=device)[:, None]
-    c2 = torch.arange(frames, device=device)[:, None, None]
-    c3 = torch.arange(redraws, device=device)[:, None, None, None]
-    k0, k1 = (half[:, None, None, None, None] for half in (high, low))
+    x = torch.arange((width + 3) // 4, device=device)
+    y = torch.arange(height, device=device)[:, None]
+    frame = torch.arange(frames, device=device)[:, None, None]
+    redraw = torch.arange(redraws, device=device)[:, None, None, None]
+    keys = (half[:, None, None, None, None] for half in (high, low))
+    four = torch.broadcast_tensors(*_philox(x, y, frame, redraw, *keys))
+    return torch.stack(four, dim=-1).flatten(-2)[..., :width]
+
+
+def words_at(
+    high: Tensor | int, low: Tensor | int, frame: Tensor, y: Tensor, x: Tensor, redraw: Tensor | int = 0
+) -> Tensor:
+    """Return the words of single pixels of the full frame, int64 [...]: all arguments are broadcast to one shape."""
+    four = _philox(x >> 2, y, frame, redraw, high, low)
+    found = four[0]
+    for n in (1, 2, 3):
+        found = torch.where((x & 3) == n, four[n], found)
+    return found
+
+
+def _philox(
+    c0: Tensor,
+    c1: Tensor,
+    c2: Tensor,
+    c3: Tensor | int,
+    k0: Tensor | int,
+    k1: Tensor | int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the four words of blocks: int64 [...] each, not yet of one shape."""
     for _ in range(ROUNDS):
         even = c0 * MULTIPLIERS[0]
         odd = c2 * MULTIPLIERS[1]
@@ -35,14 +59,19 @@ def words(high: Tensor, low: Tensor, shape: tuple[int, int, int], redraws: int =
         c3 = even & _LOW
         k0 = (k0 + KEY_STEPS[0]) & _LOW
         k1 = (k1 + KEY_STEPS[1]) & _LOW
-    four = torch.broadcast_tensors(c0, c1, c2, c3)
-    return torch.stack(four, dim=-1).flatten(-2)[..., :width]
+    assert isinstance(c3, Tensor)
+    return c0, c1, c2, c3
 
 
 def uniform(first: Tensor, second: Tensor) -> Tensor:
     """Return numbers of 64 bits in (0, 1), float64, of two words each: those of `qsim.keys.uniform`."""
     low = (second.double() + 0.5) * 2.0**-32
     return (first.double() + low) * 2.0**-32
+
+
+def uniform_of_one(word: Tensor) -> Tensor:
+    """Return numbers of 32 bits in (0, 1), float64, of one word each: those of `qsim.keys.uniform`."""
+    return (word.double() + 0.5) * 2.0**-32
 
 
 def _high(product: Tensor) -> Tensor:

@@ -48,7 +48,8 @@ class WindowPlace:
 
 
 @lru_cache(maxsize=16)
-def _pixel_array(defects: str, sensor: Sensor, shape: tuple[int, int], origin: tuple[int, int]) -> PixelArray:
+def pixel_array(defects: str, sensor: Sensor, shape: tuple[int, int], origin: tuple[int, int]) -> PixelArray:
+    """Return the pixels of frames [H, W] at their place (y, x) in the full frame, with a table of defects in JSON."""
     return PixelArray.of(stored_defects(defects), sensor, *shape, origin)
 
 
@@ -63,7 +64,7 @@ def check_windows(noise: Illumination, clip: Clip) -> None:
             "its data set out, or sense the other clips without diffraction=True"
         )
     if noise.defects is not None:
-        array = _pixel_array(noise.defects, draw.plane, clip.shape[1:], draw.origin)
+        array = pixel_array(noise.defects, draw.plane, clip.shape[1:], draw.origin)
         if array.follows_photons:
             raise ValueError(
                 f"{noise.sensor}: carry_dead_time and afterpulse of counting pixels reach from exposure to exposure, "
@@ -127,7 +128,7 @@ class WindowLight:
         _, height, width = clip.shape
         array = PixelArray(draw.plane)
         if noise.defects is not None:
-            array = _pixel_array(noise.defects, draw.plane, clip.shape[1:], draw.origin)
+            array = pixel_array(noise.defects, draw.plane, clip.shape[1:], draw.origin)
         # A window that runs backwards is exposed in that order: what came before it lies behind its end.
         before = len(exposures) - place.start - frames if place.backwards else place.start
         of_one = len(exposures[0])

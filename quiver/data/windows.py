@@ -334,6 +334,18 @@ class Windows(Dataset[dict[str, Any]]):
         seen = array_codes(codes, behind, exposure, name=clip.name)
         return sample | dict(self.prepare(replace(seen, ppp=level, shares=shares, colour=self.filters)))
 
+    def seen_by(self, place: WindowPlace) -> tuple[Sensor, float]:
+        """Return the sensor of the filled codes of a window, and their exposure [s]."""
+        draw, _, behind = self._draw(place)
+        return behind, self.clip(place.clip).exposure * draw.planes
+
+    def bad_of(self, place: WindowPlace) -> Array | None:
+        """Return the dead and hot pixels of a window, bool [h, w], not turned; None where its noise has no defects."""
+        _, bad, _ = self._draw(place)
+        if bad is None:
+            return None
+        return bad[place.y : place.y + self.settings.crop, place.x : place.x + self.settings.crop]
+
     def text_of(self, place: WindowPlace) -> str:
         """Return the text `key` of a window."""
         return (

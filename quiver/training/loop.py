@@ -529,7 +529,7 @@ def train(
             settings, lines = settled(settings, force=force)
             settings = replace(settings, threads=threads.use(asked, settings.threads).number)
             model = for_bands(model, settings)
-            system = system_of(model).on(process.device)
+            system = system_of(model).on(process.device, settings.windows)
             system.refuse(model, settings)
             validated = system.validated(model, settings)
             windows, fixed = make_windows(

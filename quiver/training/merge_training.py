@@ -16,10 +16,11 @@ import torch
 from torch import Tensor, nn
 
 from quiver.data.codes import Codes
+from quiver.data.sensor_of_window import SeenBy
 from quiver.model.blocks import WINDOW
 from quiver.restoration.merge_inputs import InformationDomain, batch_inputs, middle_inputs
 from quiver.training.settings import Protocol, Settings
-from quiver.training.system import Batch, SeenBy
+from quiver.training.system import Batch
 
 KEPT = 256  # sensors whose tables stay on a device
 NODES = 1024  # of the table from phi to light, evenly spaced in phi

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import default_collate
 
-from quiver.data.codes import Codes, Sensor
+from quiver.data.device_filling import FILL
+from quiver.data.sensor_of_window import SENSORS, TOP, SeenBy, seen_by
 from quiver.data.windows import Prepare
 from quiver.device import is_gpu
 from quiver.training.settings import Protocol, Settings
@@ -24,34 +25,15 @@ Loss = Callable[[nn.Module, Batch, Settings, float], Tensor]
 Restored = Callable[[nn.Module, Batch], tuple[Tensor, int]]
 
 
-# The sensors of the windows of a batch, a list: of inputs that are made on the device
-SENSORS = "sensors"
-TOP = "top code"  # of each of them
-
-
-@dataclass(frozen=True)
-class SeenBy:
-    """What saw a window: all that inputs need to know beside its codes."""
-
-    sensor: Sensor
-    exposure: float  # s
-    white: float  # photons
-
-
-def seen_by(codes: Codes) -> dict[str, Any]:
-    """Return the sensor of a window, in place of inputs: those are made of the complete batch."""
-    top = torch.tensor(codes.sensor.levels - 1, dtype=torch.float32)
-    return {SENSORS: SeenBy(codes.sensor, codes.exposure, codes.white), TOP: top}
-
-
 # Inputs of a batch on its device: (codes [B, T, h, w] in whole numbers, the sensor of each window) -> name -> tensor
 PrepareBatch = Callable[[Tensor, Sequence[SeenBy]], Mapping[str, Tensor]]
 
 
 def collated(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a batch of samples; their sensors stay a list."""
-    batch = default_collate([{name: value for name, value in one.items() if name != SENSORS} for one in samples])
-    return batch | ({SENSORS: [one[SENSORS] for one in samples]} if SENSORS in samples[0] else {})
+    """Return a batch of samples; their sensors and fills stay lists."""
+    lists = [name for name in (SENSORS, FILL) if name in samples[0]]
+    batch = default_collate([{name: value for name, value in one.items() if name not in lists} for one in samples])
+    return batch | {name: [one[name] for one in samples] for name in lists}
 
 
 def nothing_to_refuse(network: nn.Module, settings: Settings) -> None:
@@ -82,12 +64,13 @@ class System:
     begins: Callable[[nn.Module], float] = at_once  # share of a run after which the scored part learns
     check: Callable[[nn.Module, Settings], None] = nothing_to_refuse  # ValueError for settings that do not fit
 
-    def on(self, device: torch.device) -> System:
+    def on(self, device: torch.device, windows: str = "auto") -> System:
         """Return how the network is trained on a device: on a GPU inputs are made there, of a complete batch.
 
-        On a CPU they are made where samples are drawn, and `prepare_batch` is None.
+        On a CPU they are made where samples are drawn, and `prepare_batch` is None, unless `windows` are drawn on the
+        "device".
         """
-        if self.prepare_batch is None or not is_gpu(device):
+        if self.prepare_batch is None or not (is_gpu(device) or windows == "device"):
             return replace(self, prepare_batch=None)
         return replace(self, prepare=seen_by)
 

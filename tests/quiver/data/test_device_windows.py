@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,20 +11,29 @@ import numpy as np
 import pytest
 import torch
 from clips import ClipMaker
+from sensor_files import QIS as QIS_FILE
+from sensor_files import SPAD, sensor_file
 from torch.utils.data import DataLoader, default_collate
 from waiting import listed_waits
 
 from qsim import Camera, keys
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.fixed_pattern import DarkSpread, FixedPattern
+from qsim.sensor.qis import QIS
 from quiver.data import device_light, numpy_sums
 from quiver.data import windows as drawing
 from quiver.data.code_table import draw_codes
+from quiver.data.device_filling import Fills, fill_of
 from quiver.data.device_light import Unfit, _law_of, size_of
 from quiver.data.device_windows import SPARE, DeviceWindows
 from quiver.data.device_words import uniform, words
 from quiver.data.illumination import Illumination
+from quiver.data.mosaic_windows import filled_windows, turned_frame
+from quiver.data.sensor_of_window import seen_by
 from quiver.data.windows import STAY, Batches, Windows, WindowSettings
+from quiver.training.system import collated
 
 CPU = torch.device("cpu")
 PLENTY = 10**9  # bytes
@@ -205,24 +215,112 @@ def test_words_near_a_step_are_decided_by_64_bits(make_clip: ClipMaker):
     assert np.array_equal(found.flatten().numpy(), wanted)
 
 
-def test_a_batch_waits_for_nothing_whatever_its_size(make_clip: ClipMaker):
+@pytest.mark.parametrize("dead", [0.0, 0.1])
+def test_a_batch_waits_for_nothing_whatever_its_size(make_clip: ClipMaker, dead: float):
     """On `meta`, where a look at a value is an error. The count of operators is that of launches, at most."""
-    settings = WindowSettings(lights=LIGHTS[:4], crop=16, drift=2, force_exposure=True)
+    table = json.dumps(Defects(FixedPattern(dead=dead)).to_dict()) if dead else None
+    lights = tuple(replace(light.stated(), defects=table) for light in LIGHTS[:4])
+    settings = WindowSettings(lights=lights, crop=16, drift=2, force_exposure=True)
     windows = Windows(some_clips(make_clip), settings)
     device = DeviceWindows(windows, CPU, PLENTY)
-    for name in ("light", "gains", "cubics", "integers", "numbers"):
+    for name in ("light", "gains", "cubics", "pixels", "integers", "numbers"):
         setattr(device.held, name, getattr(device.held, name).to("meta"))
     device.turned = device.turned.to("meta")
+    device.places_of_turns = device.places_of_turns.to("meta")
     device.device = torch.device("meta")
     counts = []
     for batch in (2, 64):
         place = torch.empty(batch, 10, dtype=torch.int64, device="meta")
+        fills = fills_on_meta(batch) if dead else None
         with listed_waits() as (waits, operators):
-            found = device.drawn(place)
+            found = device.drawn(place, fills)
         assert found["codes"].shape == (batch, 11, 1, 16, 16)
         assert waits == []
         counts.append(operators.count)
-    assert counts[0] == counts[1] < 300
+    assert counts[0] == counts[1] < (500 if dead else 300)
+
+
+def fills_on_meta(batch: int) -> Fills:
+    """Return fills of windows of 16 x 16 px."""
+    bad = np.random.default_rng(0).uniform(size=(batch, 16, 16)) < 0.1
+    fills = Fills.of([fill_of(own, QIS(0.8, 1.6, 0.2, 3)) for own in bad], CPU)
+    return Fills(**{name: value.to("meta") for name, value in vars(fills).items()})
+
+
+FILES_OF_SENSORS = (SPAD, QIS_FILE, QIS_FILE.replace("read_noise", "gain = 2.5\nread_noise"))  # the last skips codes
+
+
+def random_noises(rng: np.random.Generator, folder: Path) -> tuple[Illumination, ...]:
+    """Return some lights: sensors of random bits, with random maps of gain, dark rate and dead pixels, or without."""
+    noises = []
+    for number in range(rng.integers(1, 4)):
+        bits = int(rng.integers(1, 5))
+        file = sensor_file(folder, FILES_OF_SENSORS[rng.integers(3)], bits, f"{number}.toml")
+        light = Illumination.of(file, 3.0, bits).stated()
+        pattern = FixedPattern(
+            device_seed=int(rng.integers(100)),
+            prnu=float(rng.choice([0.0, 0.2])),
+            dark=DarkSpread() if rng.integers(2) else None,
+            dead=float(rng.choice([0.0, 0.05, 0.6])),
+        )
+        defects = None if rng.integers(4) == 0 else json.dumps(Defects(pattern).to_dict())
+        noises.append(replace(light, defects=defects))
+    return tuple(noises)
+
+
+def drawn_there(device: DeviceWindows, numbers: list[int]) -> dict[str, Any]:
+    return device.draw(collated([device.places[n] for n in numbers]))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_windows_with_defects_are_those_of_the_host(make_clip: ClipMaker, tmp_path: Path, seed: int):
+    """Random maps, sensors that skip codes or not, drifts, turns, clips that are crops; filled pixels too."""
+    rng = np.random.default_rng(seed)
+    settings = WindowSettings(
+        lights=random_noises(rng, tmp_path),
+        frames=int(rng.integers(1, 8)),
+        crop=int(rng.integers(5, 20)),
+        drift=int(rng.integers(3)),
+        force_exposure=bool(rng.integers(2)),
+        seed=seed,
+    )
+    windows = Windows(some_clips(make_clip), settings, repeats=3)
+    device = DeviceWindows(windows, CPU, PLENTY)
+    for _ in range(3):
+        numbers = [int(n) for n in rng.integers(0, 10**6, rng.integers(1, 6))]
+        same(drawn_there(device, numbers), collated([windows[n] for n in numbers]))
+
+
+@pytest.mark.parametrize("good", [1, 3, 9, 60])
+def test_pixels_with_few_good_neighbours_are_filled_as_on_the_host(good: int):
+    """Of all turns, by means and by choices; also from less than eight pixels."""
+    rng = np.random.default_rng(good)
+    side = 12
+    grid: Any = np.indices((side, side))
+    for sensor in (QIS(0.8, 1.6, 0.2, 3), QIS(0.8, 1.6, 0.2, 4, 3.0)):
+        codes = rng.integers(0, sensor.levels, (8, 5, side, side)).astype(np.uint8)
+        maps = np.ones((8, side * side), bool)
+        for each in maps:
+            each[rng.permutation(side * side)[:good]] = False
+        maps = maps.reshape(8, side, side)
+        fills = Fills.of([fill_of(bad, sensor) for bad in maps], CPU)
+        turned = np.stack([turned_frame(codes[turn], turn) for turn in range(8)]).astype(np.int64)
+        places = np.stack([turned_frame(grid, turn) for turn in range(8)])
+        at = torch.from_numpy((places[:, 0] * side + places[:, 1]).reshape(8, -1).argsort(axis=1))
+        found = fills.applied(torch.from_numpy(turned), at).numpy()
+        wanted = [turned_frame(filled_windows(codes[n], maps[n], sensor, (1, 1)), n) for n in range(8)]
+        assert np.array_equal(found, np.stack(wanted))
+
+
+def test_windows_state_the_sensor_that_saw_them(make_clip: ClipMaker, tmp_path: Path):
+    """For networks whose inputs are made of a complete batch; behind defects, as on the host."""
+    noises = (*LIGHTS[:3], *random_noises(np.random.default_rng(3), tmp_path))
+    windows = Windows(some_clips(make_clip), WindowSettings(crop=8, lights=noises), prepare=seen_by)
+    device = DeviceWindows(windows, CPU, PLENTY)
+    numbers = list(range(20))
+    found = drawn_there(device, numbers)
+    assert len({seen.white for seen in found["sensors"]}) > 3
+    same(found, collated([windows[n] for n in numbers]))
 
 
 def unfit(problem: str, windows: Windows, memory: int = PLENTY) -> None:
@@ -236,6 +334,9 @@ def test_windows_that_no_device_draws_say_why(make_clip: ClipMaker, tmp_path: Pa
     unfit("copies at rest", Windows(clips, replace(plain, still=True)))
     unfit("computed where windows are drawn", Windows(clips, plain, prepare=lambda codes: {}))
     planes = Illumination.of("spad-320x240", ppp=1.0, bits=2).over(3)
+    for table in (Defects(crosstalk=0.1), Defects(FixedPattern(offset=0.1))):
+        light = replace(LIGHTS[3 if table.crosstalk else 0].stated(), defects=json.dumps(table.to_dict()))
+        unfit("has crosstalk, afterpulses, or pixels with", Windows(clips, replace(plain, lights=(light,))))
     unfit("codes of several or late exposures", Windows(clips, replace(plain, frames=4, lights=(planes,))))
     unfit("their light is 0.000133 GB, and 0.0001 GB are for it", Windows(clips, plain), 100_000)
     unfit(r"and its laws are 0.00749 GB, and 0.0002 GB are for them", Windows(clips, plain), 200_000)

@@ -14,6 +14,7 @@ from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines.information_domain import information_domain
 from quiver.data.codes import array_codes
+from quiver.data.sensor_of_window import SENSORS, TOP, SeenBy, seen_by
 from quiver.data.windows import as_input
 from quiver.model.mergenet import MergeNet, MergeNetConfig
 from quiver.model.presets import build
@@ -22,7 +23,7 @@ from quiver.training import merge_training as mt
 from quiver.training import system as training_system
 from quiver.training.loop import train
 from quiver.training.settings import Settings
-from quiver.training.system import SENSORS, TOP, SeenBy, collated, seen_by
+from quiver.training.system import collated
 from quiver.training.systems import SYSTEMS, system_of
 
 EXPOSURE = 5e-4
@@ -127,14 +128,20 @@ def test_the_inputs_of_a_batch_wait_for_nothing(device):
 def test_a_run_whose_inputs_are_made_on_the_device_learns_the_same(tiny_dataset, tmp_path, monkeypatch):
     """The CPU takes the place of the GPU; weights after some steps are those of inputs that workers make."""
     weights = []
-    for name in ("workers", "device"):
+    for name, windows in (("workers", "host"), ("windows", "device"), ("device", "host")):
         torch.manual_seed(0)
         network = MergeNet(MergeNetConfig(4))
-        settings = Settings(str(tiny_dataset), str(tmp_path / name), steps=3, crop=16, batch=2, loss="own")
-        train(network, settings, progress=False)
+        settings = Settings(
+            str(tiny_dataset), str(tmp_path / name), steps=3, crop=16, batch=2, loss="own", windows=windows
+        )
+        said = list[str]()
+        train(network, settings, progress=False, note=said.append)
+        assert any("drawn on the device" in line for line in said) == (name == "windows")
         weights.append(torch.cat([value.flatten() for value in network.state_dict().values()]))
-        monkeypatch.setattr(training_system, "is_gpu", lambda device: True)
+        if name == "windows":
+            monkeypatch.setattr(training_system, "is_gpu", lambda device: True)
     torch.testing.assert_close(weights[0], weights[1], rtol=0, atol=1e-5)
+    assert torch.equal(weights[1], weights[2])
 
 
 def test_the_loop_knows_the_system():
