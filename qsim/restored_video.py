@@ -43,6 +43,7 @@ class VideoInfo:
     sensor: dict[str, Any] = field(default_factory=dict)  # as its record describes itself
     colour: dict[str, Any] = field(default_factory=dict)  # the colour filters, as their record describes itself
     scan: str = ""  # what a scan for hot pixels found, in words; empty: there was none
+    cuts: tuple[Count, ...] = ()  # frames at which another scene or light begins
     not_inverted: str = ""  # effects of the sensor that the method leaves in the light
     source: str = ""  # the codes: a file, or in words
     codes_sha256: Text | None = None

@@ -28,7 +28,7 @@ def restore(asked: RestoreSettings, sums: PlaneSums, options: RestoreOptions, li
     from quiver.data.clips import check_outside
     from quiver.restoration.automatic import chosen
     from quiver.restoration.restored_file import restore_to_file, unnamed
-    from quiver.restoration.sources import assumed, codes_to_restore, refuse_idle
+    from quiver.restoration.sources import assumed, codes_to_restore, refuse_idle, told_of_faults
 
     target: Path = asked.output
     if target.suffix == ".zip":
@@ -45,8 +45,9 @@ def restore(asked: RestoreSettings, sums: PlaneSums, options: RestoreOptions, li
     refuse_idle(given(options) | {"method": asked.method}, [method])
     check_domain(asked, [method], [codes])
     used = use_threads(limit.threads, threads.recorded(target.with_name(f"{target.name}.part.json")))
-    if why is not None:
-        note(why)
+    for text in (why, told_of_faults(codes)):
+        if text is not None:
+            note(text)
     target.parent.mkdir(parents=True, exist_ok=True)
     lines = [assumed(codes, method)]
     started = time.monotonic()

@@ -94,6 +94,8 @@ class Codes:
     times: Times | None = None  # of the codes; None: not known
     unmapped: bool = False  # a recording whose hot pixels nothing states: they are looked for (hot_pixels.py)
     scan: str = ""  # what was found, in words
+    cuts: tuple[int, ...] = ()  # frames at which another scene or light begins (cuts.py); no method looks across them
+    faulty: tuple[int, ...] = ()  # frames that are unlike both neighbours
     unfilled: Codes | None = field(default=None, compare=False, repr=False)  # the same without filled pixels
 
     @property

@@ -25,6 +25,7 @@ from quiver.data.codes import (
     stream_codes,
     summed,
 )
+from quiver.data.cuts import cut_into_scenes
 from quiver.data.defects import check_map
 from quiver.data.hot_pixels import scanned
 from quiver.data.illumination import Illumination, is_known
@@ -32,7 +33,7 @@ from quiver.host import own_numbers
 from quiver.restoration.automatic import chosen
 from quiver.restoration.interface import AUTO, DEFAULT_METHOD, RestoreOptions, refuse_outside, remarks
 from quiver.restoration.restored_file import check_finite
-from quiver.restoration.sources import chosen_of_sensed, codes_of, refuse_idle
+from quiver.restoration.sources import chosen_of_sensed, codes_of, refuse_idle, told_of_faults
 
 Opened = Stream | Clip | Array
 Source = Opened | str | os.PathLike[str]
@@ -80,7 +81,7 @@ def restore(  # noqa: PLR0913 (settings of a public function)
     bad = None if defects is None else check_map(np.asarray(defects), "defects=")
     sums = planes if isinstance(planes, PlaneSums) else PlaneSums(planes=planes)
     codes = _codes(opened, sensor, exposure, ppp, sums)
-    codes = scanned(codes, scan) if bad is None else filled(codes, bad)
+    codes = cut_into_scenes(scanned(codes, scan) if bad is None else filled(codes, bad))
     runner, _ = chosen(method, codes, RestoreOptions(device=device or "auto", mode=mode or "exact"))
     refuse_idle({"device": device, "mode": mode, "method": method}, [runner])
     found = remarks([runner], codes)
@@ -90,6 +91,8 @@ def restore(  # noqa: PLR0913 (settings of a public function)
         found.append(f"{codes.name}: {codes.not_inverted} not inverted, restored light is too bright")
     if codes.scan and codes.defective is not None:
         found.append(f"{codes.name}: {codes.scan}, and filled; leave them with scan=False")
+    if faults := told_of_faults(codes):
+        found.append(faults)
     for text in found:
         warnings.warn(text, stacklevel=3)  # behind `own_numbers`
     with reporting(None, codes.name) as progress:

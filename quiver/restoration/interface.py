@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
@@ -102,10 +103,47 @@ class Restorer:
         """Write what `restore` returns of frames `first` ... into `out`, zeros of that shape."""
         if self.bands is not None:
             self.bands.check(codes)
+        last = first + len(out)
+        for scene in scenes(codes):
+            start = max(first, scene.start)
+            stop = min(last, scene.stop)
+            if start < stop:
+                shown = within(progress, start - first, len(out), stop - start)
+                part = out[start - first : stop - first]
+                self._fill_scene(codes_between(codes, scene), part, start - scene.start, shown)
+
+    def _fill_scene(self, codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
         if codes.colour is None:
             self.fill(codes, out, first, progress)
         else:
             fill_mosaic(self.fill, codes, out, first, progress, self.bands or Codes.demosaiced)
+
+
+# ---- Scenes of a stream
+
+
+def scenes(codes: Codes) -> list[range]:
+    """Return the frames of each scene of a stream, one after the other: all of them if it has no cut."""
+    edges = [0, *codes.cuts, codes.shape[0]]
+    return [range(first, last) for first, last in pairwise(edges)]
+
+
+def codes_between(codes: Codes, frames: range) -> Codes:
+    """Return the codes of successive frames of a stream, as a stream without a cut."""
+    if len(frames) == codes.shape[0]:
+        return codes
+
+    def read(start: int, stop: int) -> Array:
+        return codes.read(frames.start + start, frames.start + stop)
+
+    return replace(codes, shape=(len(frames), *codes.shape[1:]), read=read, cuts=(), faulty=())
+
+
+def within(progress: Progress | None, before: int, total: int, frames: int) -> Progress | None:
+    """Return the progress of some frames as that of `total` ones, of which so many are before them."""
+    if progress is None or frames == total:
+        return progress
+    return lambda done, of: progress(before + done * frames // of, total)
 
 
 # ---- What is said of methods on a stream

@@ -43,6 +43,7 @@ WHAT_CHANGED = {  # key of the description -> its name in the message that a res
     "times": "the planes",
     "planes": "the planes",
     "source": "the source",
+    "cuts": "the cuts between scenes",
     "quiver": "the program's version",
 }
 
@@ -148,6 +149,7 @@ def _described(codes: Codes, method: Restorer) -> VideoInfo:
         colour={} if codes.colour is None else codes.colour.to_dict() | by_places,
         not_inverted=codes.not_inverted,
         scan=codes.scan,
+        cuts=codes.cuts,
     )
 
 

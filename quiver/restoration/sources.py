@@ -161,6 +161,19 @@ def _least_bits(path: Path) -> int:
     return 1 if load_array(path).dtype == np.bool_ else 3
 
 
+def _numbers(frames: Sequence[int]) -> str:
+    """Return frame numbers as text, ten at most."""
+    shown = ", ".join(map(str, frames[:10]))
+    return shown if len(frames) <= 10 else f"{shown} and {len(frames) - 10} more"
+
+
+def told_of_faults(codes: Codes) -> str | None:
+    """Return one line on the faulty frames of a stream; None without any."""
+    if not codes.faulty:
+        return None
+    return f"{codes.name}: unlike both frames beside them (black, white or a flash): {_numbers(codes.faulty)}"
+
+
 def assumed(codes: Codes, method: Restorer) -> str:
     """Return one line with everything that a restoration assumes."""
     length, height, width = codes.shape
@@ -173,6 +186,7 @@ def assumed(codes: Codes, method: Restorer) -> str:
         light += f", each of {rows} x {columns} places of the colour filters alone, then demosaiced"
     light += f", {codes.scan}" if codes.scan else ""
     light += f", {bad} of {height * width} pixels defective and filled from their neighbours" if bad else ""
+    light += f", cut before frames {_numbers(codes.cuts)}" if codes.cuts else ""
     light += f", {codes.not_inverted} not inverted (restored light is too bright)" if codes.not_inverted else ""
     seen = f"{method.frames_used} frames" if method.seamless else f"all earlier and {method.look_ahead} later frames"
     return (

@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 
 from qsim.keys import Key, hash_name
 from quiver.data.codes import Codes, light_of
-from quiver.restoration.interface import Restorer
+from quiver.restoration.interface import Restorer, scenes
 from quiver.restoration.risk import Reading, block_sums, mean_and_error, redraw, scores
 
 SIDE = 128  # px of a piece, less where the frame is smaller
@@ -94,15 +94,19 @@ class _Tally:
 
 
 def affordable(codes: Codes, methods: Sequence[Restorer], share: float = COST) -> int:
-    """Return on how many pieces, PIECES at most, these methods can be tried for a share of restoring by the first."""
+    """Return on how many pieces, PIECES at most, these methods can be tried for a share of restoring by the first.
+
+    Pieces of a short stream are no more than fit between its ends side by side.
+    """
     length, height, width = codes.shape
     if min(height, width) < SMALLEST:
         return 0
-    piece = 2 * min(SIDE, height) * min(SIDE, width) * sum(cost_of(method) for method in methods)
-    whole = length * height * width * cost_of(methods[0])
-    if share * whole >= PIECES * piece:
-        return PIECES
-    return int(share * whole // piece)
+    area = min(SIDE, height) * min(SIDE, width)
+    between_ends = length - 2 * _end(length, _window(methods))
+    distinct = max(FEWEST, between_ends * height * width // area)
+    piece = 2 * area * sum(cost_of(method) for method in methods)
+    paid = share * length * height * width * cost_of(methods[0]) / piece
+    return int(min(paid, distinct, PIECES))
 
 
 def cost_of(method: Restorer) -> float:
@@ -120,8 +124,9 @@ def tried(codes: Codes, methods: Sequence[Restorer], pieces: int, seed: int = 0)
     left = {method.name: method for method in methods}
     tally = _Tally({name: [] for name in left})
     peak = PEAK * light_of(codes)
-    for n, place in enumerate(places(codes.shape, pieces, seed)):
-        piece = _Piece.read(codes, place, max(method.window for method in left.values()))
+    window = _window(methods)
+    for n, place in enumerate(places(codes.shape, pieces, window, seed)):
+        piece = _Piece.read(codes, place, window)
         _add(tally, piece, left, reading, peak, Key(seed, hash_name(codes.name), n, STAGE))
         if tally.pieces >= FEWEST:
             _give_up(left, tally)
@@ -130,17 +135,30 @@ def tried(codes: Codes, methods: Sequence[Restorer], pieces: int, seed: int = 0)
     return _verdict(methods[0].name, tally)
 
 
-def places(shape: tuple[int, int, int], pieces: int, seed: int = 0) -> Iterator[Place]:
+def _window(methods: Sequence[Restorer]) -> int:
+    """Return the largest window of the methods in frames."""
+    return max(method.window for method in methods)
+
+
+def _end(length: int, window: int) -> int:
+    """Return the frames at each end of a stream where a window is not complete, fewer if there are no others."""
+    return min(window // 2, (length - 1) // 2)
+
+
+def places(shape: tuple[int, int, int], pieces: int, window: int, seed: int = 0) -> Iterator[Place]:
     """Yield where so many pieces of a stream [T, H, W] lie: at random, one in each of as many parts of its frames.
 
-    They come in random order, so that a trial that ends early has seen all parts of the stream.
+    Frames at the ends, where a window is not complete, are left out. The pieces come in random order, so that a trial
+    that ends early has seen all parts of the stream.
     """
     length, height, width = shape
     rng = np.random.default_rng([seed, STAGE])
     rows = min(SIDE, height)
     columns = min(SIDE, width)
+    end = _end(length, window)
+    inner = length - 2 * end
     for part in rng.permutation(pieces):
-        frame = min(length - 1, int((part + rng.random()) * length / pieces))
+        frame = end + min(inner - 1, int((part + rng.random()) * inner / pieces))
         y = int(rng.integers(height - rows + 1))
         x = int(rng.integers(width - columns + 1))
         yield Place(frame, y, x, rows, columns)
@@ -157,8 +175,9 @@ class _Piece:
     @classmethod
     def read(cls, codes: Codes, place: Place, window: int) -> _Piece:
         """Return the piece at a place, with the frames around it that methods of this window see."""
-        first = max(0, place.frame - window // 2)
-        last = min(codes.shape[0], place.frame + window // 2 + 1)
+        scene = next(scene for scene in scenes(codes) if place.frame in scene)
+        first = max(scene.start, place.frame - window // 2)
+        last = min(scene.stop, place.frame + window // 2 + 1)
         here = (slice(place.y, place.y + place.height), slice(place.x, place.x + place.width))
         seen = codes.read(first, last)[(slice(None), *here)].copy()
         good = np.ones(seen.shape[1:], bool) if codes.defective is None else ~codes.defective[here]
@@ -186,7 +205,7 @@ def _of_array(codes: Codes, seen: Array) -> Codes:
         return seen[start:stop]
 
     shape = (len(seen), seen.shape[1], seen.shape[2])
-    return replace(codes, shape=shape, read=read, digest=str, defective=None, unfilled=None)
+    return replace(codes, shape=shape, read=read, digest=str, defective=None, unfilled=None, cuts=())
 
 
 def _add(

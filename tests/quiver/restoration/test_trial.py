@@ -120,13 +120,28 @@ def test_pieces_are_spread_over_the_stream_and_lie_within_it():
     rng = np.random.default_rng(0)
     for seed in range(50):
         shape = (int(rng.integers(1, 500)), int(rng.integers(48, 400)), int(rng.integers(48, 400)))
-        found = list(trial.places(shape, 6, seed))
+        found = list(trial.places(shape, 6, 11, seed))
         frames = sorted(place.frame for place in found)
+        end = min(5, (shape[0] - 1) // 2)
+        inner = shape[0] - 2 * end
         for n, frame in enumerate(frames):
-            assert n * shape[0] / 6 - 1 < frame < (n + 1) * shape[0] / 6
+            assert n * inner / 6 - 1 < frame - end < (n + 1) * inner / 6
         for place in found:
             assert 0 <= place.y <= place.y + place.height <= shape[1]
             assert 0 <= place.x <= place.x + place.width <= shape[2]
+
+
+def test_a_piece_does_not_look_across_a_cut():
+    codes = replace(stream_of(soft(12, 96), 3.25), cuts=(6,))
+    reads = []
+
+    def read(start: int, stop: int) -> Array:
+        reads.append((start, stop))
+        return codes.read(start, stop)
+
+    trial.tried(replace(codes, read=read), [blurring("one", 1.5), blurring("another", 1.6)], 6)
+    assert reads
+    assert all(stop <= 6 or start >= 6 for start, stop in reads)
 
 
 def constant(name: str, photons: float) -> Restorer:
