@@ -22,6 +22,7 @@ from statistics import median
 from typing import Any
 
 import result_page
+import rows
 
 from qsim.files import write_bytes
 from qsim.tables import markdown_table
@@ -111,21 +112,37 @@ def equal_files(before: list[dict[str, str]], after: list[dict[str, str]]) -> st
     return f"{sum(one == other for one, other in pairs)} of {len(pairs)}"
 
 
+def page(table: list[tuple[str, ...]], size: tuple[int, int], runs: int, frames: int, revision: str, busy: bool) -> str:
+    """Return the page of all clips."""
+    command = f"render_against.py FOLDER --size {size[0]} {size[1]}"
+    text = result_page.head("A frame of I2 before and now", command, f"; FOLDER has revision {revision}")
+    text += [
+        f"Medians of {runs} runs of each program in turn, {frames} frames each. Milliseconds are those of the "
+        "processor, of all threads; the ratio is that of the medians. Files are pictures and ground truth.",
+        "",
+    ]
+    names = ("clip", "samples, neighbours, denoiser", "before [ms]", "now [ms]", "ratio", "equal files")
+    text += [*markdown_table(table, names), "", f"Machine: {rows.processor()}.", ""]
+    text += ["Measured beside other programs.", ""] * busy
+    return "\n".join(text)
+
+
 def main() -> None:
     """Print or write the page of both programs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("before", type=Path, help="folder of another checkout")
     parser.add_argument("--size", type=int, nargs=2, default=(512, 1024), help="rows and columns")
     parser.add_argument("--runs", type=int, default=3, help="runs of each program, in turn")
-    parser.add_argument("--skipped", type=int, default=2, help="first frames that do not count")
-    parser.add_argument("--frames", type=int, default=4, help="frames that count")
+    parser.add_argument("--skipped", type=int, default=3, help="first frames that do not count")
+    parser.add_argument("--frames", type=int, default=3, help="frames that count")
     parser.add_argument("--clips", default=",".join(case.name for case in CASES), help="names, with commas")
+    parser.add_argument("--busy", action="store_true", help="say that other programs ran beside")
     parser.add_argument("--page", type=Path, help="file to write")
     asked = parser.parse_args()
     if not (asked.before / "qsim").is_dir():
         parser.error(f"{asked.before}: not a checkout of this program, as it has no folder qsim")
     programs = {"before": asked.before.resolve(), "now": ROOT}
-    table = []
+    table: list[tuple[str, ...]] = []
     for case in CASES:
         if case.name not in asked.clips.split(","):
             continue
@@ -144,17 +161,7 @@ def main() -> None:
         text=True,
         check=True,
     ).stdout.strip()
-    height, width = asked.size
-    text = result_page.head("A frame of I2 before and now", "render_against.py FOLDER", f"; FOLDER has {revision}")
-    text += [
-        f"Medians of {asked.runs} runs of each program in turn, {asked.frames} frames of {height} x {width} px each. "
-        "Milliseconds of the",
-        "processor, of all threads; the ratio is that of the medians. Files are the pictures and the ground truth.",
-        "",
-    ]
-    names = ("clip", "samples, neighbours, denoiser", "before [ms]", "now [ms]", "ratio", "equal files")
-    text += [*markdown_table(table, names), ""]
-    content = "\n".join(text)
+    content = page(table, tuple(asked.size), asked.runs, asked.frames, revision, asked.busy)
     if asked.page is None:
         print(content)
     else:
