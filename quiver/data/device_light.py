@@ -23,6 +23,7 @@ from qsim.optics.radiometry import illumination, off_axis_cosines, photon_energy
 from qsim.sensor.defects.fixed_pattern import lit
 from qsim.sensor.sensor import Sensor
 from qsim.streams.clip import Clip
+from qsim.streams.exposures import Timing
 from qsim.streams.simulation import Draw
 from quiver.data.clips import has_sharp, peak_of
 from quiver.data.illumination import Illumination
@@ -35,8 +36,8 @@ ERROR = 1e-13  # of a cubic, at most
 FAINT = 1e-13  # chance of a code below the top one that the brightest light of the cubics leaves
 WIDEST = 7  # bits of codes, by memory: 127 steps take 133 MB
 FINEST = 1024  # parts of a pixel at which an axis may lie
-INTEGERS = 12  # of a clip and noise: places in the memories of light, gains, laws and pixels; sizes, origin
-NUMBERS = 8  # of a clip and noise: factors of photons, white, peak
+INTEGERS = 15  # of a clip and noise: places in the memories of light, gains, laws and pixels; sizes, origin, planes
+NUMBERS = 9  # of a clip and noise: factors of photons, white, peak
 
 
 class Unfit(ValueError):
@@ -114,6 +115,11 @@ def _fall_off(clip: Clip, camera: Camera, scale: float) -> Array:
     return illumination(height, width, *axis, camera.focal_pixels, camera.lens, camera.vignetting)
 
 
+def is_in_place(noise: Illumination) -> bool:
+    """Return whether the random numbers of a window are those of its place in the full frame, as `Windows` has them."""
+    return noise.defects is not None or noise.timing != Timing()
+
+
 def _pixels_of(clip: Clip, noise: Illumination, draw: Draw) -> tuple[Sensor, Array | None]:
     """Return the sensor that draws codes of exposures, and of pixels with maps two numbers each, float64 [H W, 2].
 
@@ -175,7 +181,8 @@ class HeldClips:
         self.cubics = torch.empty((0, 4), dtype=torch.float64, device=device)
         self.pixels = torch.ones((1, 2), dtype=torch.float64, device=device)  # the first one is that of no defects
         self.pixels[0, 1] = 0
-        self.defects = any(noise.defects is not None for noise in windows.noise.noises)
+        self.in_place = any(map(is_in_place, windows.noise.noises))
+        self.planes = max(noise.planes for noise in windows.noise.noises)  # of a code, at most
         self.integers = torch.zeros((rows, INTEGERS), dtype=torch.int64, device=device)
         self.numbers = torch.ones((rows, NUMBERS), dtype=torch.float64, device=device)
         self.sharp = False  # whether a clip has sharp frames
@@ -202,13 +209,15 @@ class HeldClips:
             law_at, law = self._place_of_law(drawing, clip.exposure)
             array = self._place_of_pixels((noise.defects, draw.plane, *clip.shape[1:], draw.origin), pixels)
             light_at = first, sharp, height * width, width, place, int(gain.map is not None)
-            integers.append((*light_at, law_at, law.steps, array, int(pixels is not None), *draw.origin))
-            white = draw.sensor.white(clip.exposure)
+            pixels_at = array, int(pixels is not None), int(is_in_place(noise)), *draw.origin
+            integers.append((*light_at, law_at, law.steps, *pixels_at, draw.planes, draw.sensor.levels - 1))
+            white = draw.sensor.white(clip.exposure * draw.planes)
             forced = self.windows.settings.force_exposure
-            peak = white if forced else peak_of(draw.level.ppp)
+            peak = white if forced else peak_of(draw.level.ppp * draw.planes)
             ceiling = max(self.windows.settings.ceiling, peak / white)
             wanted = noise.ppp if forced and noise.ppp is not None else math.nan
-            numbers.append((gain.scale, gain.rate, draw.level.factor, law.rate, white, peak, ceiling, wanted))
+            factors = gain.scale, gain.rate, draw.level.factor, draw.level.factor * draw.planes
+            numbers.append((*factors, law.rate, white, peak, ceiling, wanted))
         rows = slice(slot * len(noises), (slot + 1) * len(noises))
         self.integers[rows] = self._sent(torch.tensor(integers))
         self.numbers[rows] = self._sent(torch.tensor(numbers, dtype=torch.float64))

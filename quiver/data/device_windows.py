@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -88,8 +89,11 @@ def why_not(windows: Windows) -> str | None:
     if windows.filters is not None:
         return "they have colour filters"
     for noise in windows.noise.noises:
-        if noise.timing != Timing() or noise.sensing.diffraction:
-            return f"{noise.label}: has diffraction, or codes of several or late exposures"
+        timing = noise.timing
+        if timing != Timing(timing.frames, timing.summed) or noise.sensing.diffraction:
+            return f"{noise.label}: has diffraction, or exposures that are late, unequal or of light that drifts"
+        if timing.frames > 1 and not timing.summed:
+            return f"{noise.label}: has codes of several slices"
         found = Defects() if noise.defects is None else stored_defects(noise.defects)
         if found.disturbed or found.read_out:
             return f"{noise.label}: has crosstalk, afterpulses, or pixels with an offset or read noise of their own"
@@ -166,10 +170,12 @@ class DeviceWindows:
         """
         held = self.held
         row, start, y, x, dy, dx, turn, backwards, high, low = place.unbind(1)
-        *light_at, law, steps, array, arrayed, top_of_clip, left_of_clip = held.integers.index_select(0, row).unbind(1)
+        *light_at, law, steps, array, arrayed, in_place, clip_y, clip_x, planes, highest = held.integers.index_select(
+            0, row
+        ).unbind(1)
         first, sharp, frame, width, gain, mapped = light_at
         # float64 [B, 1, 1, 1]
-        scale, rate, factor, cells, white, peak, ceiling, wanted = (
+        scale, rate, factor, factor_of_code, cells, white, peak, ceiling, wanted = (
             each[:, None, None, None] for each in held.numbers.index_select(0, row).unbind(1)
         )
         frames = self.shape[0]
@@ -179,34 +185,48 @@ class DeviceWindows:
         top = (y[:, None] + dy[:, None] * at)[:, :, None, None]
         left = (x[:, None] + dx[:, None] * at)[:, :, None, None]
         pixel = (top + rows[:, None]) * _all(width) + left + columns[:, None]  # [B, T, side, side]
-        stored = pixel + (frame[:, None] * (start[:, None] + at))[:, :, None, None]
         share = held.gains[_all(gain) + pixel * _all(mapped)]
-
-        def photons(base: Tensor) -> Tensor:
-            return held.light[_all(base) + stored].double() * share * scale * rate * factor
-
-        exposed = photons(first)
-        clean = photons(sharp) if held.sharp else exposed
+        light = _Light(
+            held=held,
+            pixel=pixel,
+            share=share,
+            codes=start[:, None] + at,
+            frame=frame,
+            planes=planes,
+            backwards=backwards,
+            gain=(scale, rate),
+        )
+        exposed = light.of_code(first, factor)
+        clean = exposed
+        if held.planes > 1 or held.sharp:
+            clean = light.middle(sharp, factor_of_code)
+        brighter: Tensor | float = 1.0
         if self.windows.settings.force_exposure:
             own = _all(numpy_sums.mean(exposed.flatten(1))).clamp(min=DARKEST)
-            exposed = exposed * torch.where(wanted.isnan(), 1.0, wanted / own)
-        if held.defects:
+            brighter = torch.where(wanted.isnan(), 1.0, wanted / own)
+            exposed = exposed * brighter
+        if held.in_place:
             # Defects are those of a place in the full frame, and so are the random numbers of its pixels.
             fixed = (y[:, None, None] + rows) * width[:, None, None] + x[:, None, None] + columns
             numbers = held.pixels[array[:, None, None] + fixed * arrayed[:, None, None]]  # [B, side, side, 2]
-            brighter, dark = (each[:, None] for each in numbers.unbind(-1))
-            corner = top_of_clip + y, left_of_clip + x
-            drawn_at = self._counters(arrayed, start * (1 - backwards), corner, (rows, columns))
+            efficient, dark = (each[:, None] for each in numbers.unbind(-1))
+            corner = clip_y + y, clip_x + x
+            code, line, column = self._counters(in_place, start * (1 - backwards), corner, (rows, columns))
             redraw = torch.arange(2, device=self.device)[:, None, None, None]
             upper, lower = (half[:, None, None, None, None] for half in (high, low))
-            drawn = words_at(upper, lower, *drawn_at, redraw)
-            codes = self._codes(exposed * brighter + dark, cells, law, steps, drawn)
+            codes = torch.zeros_like(pixel)
+            for number in range(held.planes):
+                plane = code * planes[:, None, None, None, None] + number
+                drawn = words_at(upper, lower, plane, line, column, redraw)
+                photons = light.of_plane(number, first, factor) * brighter * efficient + dark
+                fired = self._codes(photons, cells, law, steps, drawn)
+                codes = codes + torch.where(_all(planes) > number, fired, 0)
         else:
             codes = self._codes(exposed, cells, law, steps, words(high, low, self.shape, redraws=2))
         if fills is not None:
             codes = fills.applied(codes, self.places_of_turns.index_select(0, turn))
         return {
-            "codes": (codes.float() / _all(steps).float())[:, :, None],
+            "codes": (codes.float() / _all(highest).float())[:, :, None],
             "target": torch.minimum(clean / white, ceiling).float()[:, :, None],
             "white": white.flatten(),
             "peak": peak.flatten(),
@@ -214,18 +234,18 @@ class DeviceWindows:
         }
 
     def _counters(
-        self, arrayed: Tensor, number: Tensor, corner: tuple[Tensor, Tensor], inside: tuple[Tensor, Tensor]
+        self, in_place: Tensor, number: Tensor, corner: tuple[Tensor, Tensor], inside: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return frame, row and column [B, 1, T or 1, side, side] of the random numbers of all pixels.
+        """Return code, row and column [B, 1, T or 1, side, side] of the random numbers of all pixels.
 
-        Windows with defects (`arrayed`) have those of the full frame, from frame `number` and their `corner` on and not
+        Windows that are drawn `in_place` have those of the full frame, from code `number` and their `corner` on and not
         turned. Others have those of the turned window, from 0 on. `inside` are rows and columns before turns.
         """
-        with_defects = arrayed[:, None, None] == 1
-        frame = torch.arange(self.shape[0], device=self.device) + (number * arrayed)[:, None]
+        placed = in_place[:, None, None] == 1
+        code = torch.arange(self.shape[0], device=self.device) + (number * in_place)[:, None]
         places = zip(corner, inside, self.turned[0], strict=True)
-        y, x = (torch.where(with_defects, first[:, None, None] + own, plain) for first, own, plain in places)
-        return frame[:, None, :, None, None], y[:, None, None], x[:, None, None]
+        y, x = (torch.where(placed, first[:, None, None] + own, plain) for first, own, plain in places)
+        return code[:, None, :, None, None], y[:, None, None], x[:, None, None]
 
     def _codes(self, photons: Tensor, cells: Tensor, law: Tensor, steps: Tensor, drawn: Tensor) -> Tensor:
         """Return codes int64 [B, T, h, w]: how many steps lie at or below the number of each pixel."""
@@ -243,6 +263,47 @@ class DeviceWindows:
             reached = number >= ((c3 * share + c2) * share + c1) * share + c0
             codes = torch.where(reached & (wanted <= _all(steps)), wanted, codes)
         return codes
+
+
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """The light of a batch of windows, turned and in the order of exposure; a code has `planes` exposures."""
+
+    held: HeldClips
+    pixel: Tensor  # int64 [B, T, h, w], in its frame
+    share: Tensor  # float64 [B, T, h, w]
+    codes: Tensor  # int64 [B, T], their numbers in the clip
+    frame: Tensor  # int64 [B], pixels of a frame
+    planes: Tensor  # int64 [B]
+    backwards: Tensor  # int64 [B], 0 or 1
+    gain: tuple[Tensor, Tensor]  # float64 [B, 1, 1, 1]
+
+    def of_code(self, base: Tensor, strength: Tensor) -> Tensor:
+        """Return the photons of each code."""
+        found = self.of_plane(0, base, strength)
+        for number in range(1, self.held.planes):
+            found = found + self.of_plane(number, base, strength)
+        return found
+
+    def of_plane(self, number: int, base: Tensor, strength: Tensor) -> Tensor:
+        """Return the photons of a plane, in the order of exposure; 0 where a code has fewer."""
+        if self.held.planes == 1:
+            return self._photons(base, strength, self.codes)
+        last = self.planes - 1 - number
+        own = torch.where(self.backwards == 1, last, number).clamp(min=0).minimum(self.planes - 1)
+        photons = self._photons(base, strength, self.codes * self.planes[:, None] + own[:, None])
+        return torch.where(_all(last) >= 0, photons, 0.0)
+
+    def middle(self, base: Tensor, strength: Tensor) -> Tensor:
+        """Return the photons of the clip frame in the middle of each code."""
+        if self.held.planes == 1:
+            return self._photons(base, strength, self.codes)
+        return self._photons(base, strength, self.codes * self.planes[:, None] + (self.planes // 2)[:, None])
+
+    def _photons(self, base: Tensor, strength: Tensor, frames_of_clip: Tensor) -> Tensor:
+        stored = self.pixel + (self.frame[:, None] * frames_of_clip)[:, :, None, None]
+        scale, rate = self.gain
+        return self.held.light[_all(base) + stored].double() * self.share * scale * rate * strength
 
 
 def _all(each: Tensor) -> Tensor:

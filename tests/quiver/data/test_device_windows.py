@@ -190,7 +190,7 @@ def test_a_million_codes_over_all_light_are_those_of_the_reference(make_clip: Cl
     photons[0, :5] = 0
     key = Key(3, 4)
     halves = torch.tensor([divmod(key.philox_key, 1 << 32)])
-    row = device.held.numbers[:, 3][:, None, None, None], device.held.integers[:, 6], device.held.integers[:, 7]
+    row = device.held.numbers[:, 4][:, None, None, None], device.held.integers[:, 6], device.held.integers[:, 7]
     drawn = words(*halves.unbind(1), photons.shape, redraws=2)
     found = device._codes(torch.from_numpy(photons)[None], *row, drawn)
     wanted = draw_codes(sensor, photons, clip.exposure, key)
@@ -210,7 +210,7 @@ def test_words_near_a_step_are_decided_by_64_bits(make_clip: ClipMaker):
     second = rng.integers(0, 2**32, 4000, dtype=np.uint64).astype(np.uint32)
     wanted = sensor.draw(photons, clip.exposure, first, lambda some: second[some])
     drawn = torch.from_numpy(np.stack([first, second]).astype(np.int64))[None, :, None, None]
-    row = device.held.numbers[:, 3][:, None, None, None], device.held.integers[:, 6], device.held.integers[:, 7]
+    row = device.held.numbers[:, 4][:, None, None, None], device.held.integers[:, 6], device.held.integers[:, 7]
     found = device._codes(torch.from_numpy(photons)[None, None, None], *row, drawn)
     assert np.array_equal(found.flatten().numpy(), wanted)
 
@@ -291,6 +291,29 @@ def test_windows_with_defects_are_those_of_the_host(make_clip: ClipMaker, tmp_pa
         same(drawn_there(device, numbers), collated([windows[n] for n in numbers]))
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_windows_of_summed_planes_are_those_of_the_host(make_clip: ClipMaker, tmp_path: Path, seed: int):
+    """Sums of several numbers of planes, with and without defects, beside codes of one exposure."""
+    rng = np.random.default_rng(seed)
+    sums = [Illumination.of("spad-320x240", ppp=2.0, bits=bits).over(2**bits - 1) for bits in (1, 2)]
+    pattern = FixedPattern(prnu=0.2, dead=0.1, dark=DarkSpread())
+    marked = replace(sums[1].stated(), defects=json.dumps(Defects(pattern).to_dict()))
+    lights = (*sums, marked, LIGHTS[0])
+    settings = WindowSettings(
+        lights=tuple(lights[i] for i in rng.permutation(4)[: rng.integers(1, 5)]),
+        frames=int(rng.integers(1, 5)),
+        crop=int(rng.integers(5, 20)),
+        drift=int(rng.integers(3)),
+        force_exposure=bool(rng.integers(2)),
+        seed=seed,
+    )
+    windows = Windows(some_clips(make_clip), settings, repeats=3, prepare=seen_by)
+    device = DeviceWindows(windows, CPU, PLENTY)
+    for _ in range(3):
+        numbers = [int(n) for n in rng.integers(0, 10**6, rng.integers(1, 6))]
+        same(drawn_there(device, numbers), collated([windows[n] for n in numbers]))
+
+
 @pytest.mark.parametrize("good", [1, 3, 9, 60])
 def test_pixels_with_few_good_neighbours_are_filled_as_on_the_host(good: int):
     """Of all turns, by means and by choices; also from less than eight pixels."""
@@ -333,11 +356,13 @@ def test_windows_that_no_device_draws_say_why(make_clip: ClipMaker, tmp_path: Pa
     plain = WindowSettings(crop=16)
     unfit("copies at rest", Windows(clips, replace(plain, still=True)))
     unfit("computed where windows are drawn", Windows(clips, plain, prepare=lambda codes: {}))
-    planes = Illumination.of("spad-320x240", ppp=1.0, bits=2).over(3)
     for table in (Defects(crosstalk=0.1), Defects(FixedPattern(offset=0.1))):
         light = replace(LIGHTS[3 if table.crosstalk else 0].stated(), defects=json.dumps(table.to_dict()))
         unfit("has crosstalk, afterpulses, or pixels with", Windows(clips, replace(plain, lights=(light,))))
-    unfit("codes of several or late exposures", Windows(clips, replace(plain, frames=4, lights=(planes,))))
+    slices = LIGHTS[0].over(3)
+    unfit("has codes of several slices", Windows(clips, replace(plain, frames=3, lights=(slices,))))
+    late = LIGHTS[0].but(row_delay=1e-6)
+    unfit("exposures that are late, unequal", Windows(clips, replace(plain, frames=3, lights=(late,))))
     unfit("their light is 0.000133 GB, and 0.0001 GB are for it", Windows(clips, plain), 100_000)
     unfit(r"and its laws are 0.00749 GB, and 0.0002 GB are for them", Windows(clips, plain), 200_000)
 
