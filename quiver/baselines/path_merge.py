@@ -9,7 +9,8 @@ nearby: 1 where the scene is the same. The first finds large areas at little lig
 a path misses by a pixel. The worse one decides. A frame that a path leads out of the picture has no weight, so the ends
 of a stream need no invented frames.
 
-The count of a pixel is (sum of weights)^2 / sum of squared weights: the codes that, averaged alike, have its noise.
+The count of a pixel is the number of codes whose mean has its noise: (sum of weights)^2 over the sum of squared weights
+times the share of the noise that is left where a moved frame is sampled between its pixels.
 
 A batch of windows is merged at once, on any device; nothing waits for the host. Frames of a group share their weight,
 so sums of a group's frames are all that is kept of them.
@@ -34,7 +35,7 @@ from qsim.sensor.sensor import Sensor
 from quiver.baselines.domain_tables import DomainTables, domain_tables
 from quiver.baselines.information_domain import InformationDomain, information_domain
 from quiver.baselines.paths.motion_paths import Moves, moves
-from quiver.baselines.paths.moved_frames import CHUNK, SCALES, box_mean, enlarged, halved, look
+from quiver.baselines.paths.moved_frames import CHUNK, SCALES, box_mean, enlarged, halved, look_sharply
 from quiver.baselines.sliding_window import check_window, checked_codes, equal_windows, in_units
 from quiver.device import is_gpu
 
@@ -43,6 +44,7 @@ from quiver.device import is_gpu
 STATISTICS = ((1, 1, 3.0, 1.0), (0, 2, 1.6, 0.25))
 GROUPS = ((-1,), (1,), (-2, -3), (2, 3), (-4, -5), (4, 5))  # offsets of the frames that `Merged.groups` averages
 PIXEL_BYTES = 3_000  # that a pixel of a window takes on a GPU, where all frames and velocities are tried at a time
+LEAST_NOISE = 0.1  # of a group of frames; a cubic leaves a frame half of its noise
 NEAR = 2  # groups of one frame beside the reference; the other frames are compared with the mean of these three
 
 
@@ -58,7 +60,17 @@ class Merged:
     still: Tensor  # mean code of the window without motion
     frames: int  # in the window
     groups: Tensor  # [B, 6, H, W], mean codes of GROUPS, moved and not weighted
-    group_counts: Tensor  # [B, 6, H, W], frames of each that lie in the picture
+    group_counts: Tensor  # [B, 6, H, W], codes whose mean has the noise of each; 0 without a frame in the picture
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Moved frames of each group, where they lie in the picture, float32 [B, G, H, W] each."""
+
+    sums: Tensor  # of their codes
+    counts: Tensor  # frames
+    noise: Tensor  # variance of the sum over that of one code
+    beside: Tensor  # [B, 2, H, W], the frames beside the reference wherever they lie: 0 where there is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,21 +119,28 @@ def merge(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Mer
     pooled = halved(codes)
     # The noise that the search for paths expects, from the window without motion: only its size matters there.
     deviation = tables.variance(box_mean(pooled.mean(1), 2)).sqrt()
-    found = moves(window.pyramid, offsets, pooled, deviation)
+    return merge_along(window, offsets, tables, moves(window.pyramid, offsets, pooled, deviation))
+
+
+@torch.no_grad()
+def merge_along(window: Prepared, offsets: Sequence[int], tables: DomainTables, found: Moves) -> Merged:
+    """Return the reference frames of windows [B, K, H, W], merged along motions that are known."""
+    codes = window.codes
     alone = codes[:, offsets.index(0)]
-    sums, counts, beside = _group_sums(codes, found, offsets, window.size)
-    weights, means, near_total, near_mean = group_weights(alone, sums, counts, beside, tables)
-    total, mean_code = _weighted(alone, weights, sums, counts)
+    groups = _groups(codes, found, offsets, window.size)
+    weights, means, near_total, near_mean = group_weights(alone, groups.sums, groups.counts, groups.beside, tables)
+    total, mean_code = _weighted(alone, weights, groups.sums, groups.counts)
+    shown = slice(len(GROUPS))
     return Merged(
         mean_code,
-        _count(total, weights, counts),
+        _count(total, weights, groups.noise),
         alone,
         near_mean,
-        _count(near_total, weights[:, :NEAR], counts[:, :NEAR]),
+        _count(near_total, weights[:, :NEAR], groups.noise[:, :NEAR]),
         codes.sum(1).div_(len(offsets)),
         frames=len(offsets),
-        groups=means[:, : len(GROUPS)],
-        group_counts=counts[:, : len(GROUPS)],
+        groups=means[:, shown],
+        group_counts=groups.counts[:, shown].square().div_(groups.noise[:, shown].clamp(min=LEAST_NOISE)),
     )
 
 
@@ -131,16 +150,13 @@ def groups_of(offsets: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     return GROUPS + tuple((2 * side * n, side * (2 * n + 1)) for n in range(3, last + 1) for side in (-1, 1))
 
 
-def _group_sums(
-    codes: Tensor, found: Moves, offsets: Sequence[int], size: tuple[int, int]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return sums of the moved frames of each group where they lie in the picture, [B, G, H, W], how many do, and the
-    frames beside the reference wherever they lie, [B, 2, H, W]: 0 where there is none.
-    """
+def _groups(codes: Tensor, found: Moves, offsets: Sequence[int], size: tuple[int, int]) -> Groups:
+    """Return the sums of the frames of windows of codes [B, K, H, W], moved; `size` is that of a frame in them."""
     batch, _, height, width = codes.shape
     groups = groups_of(offsets)
     sums = codes.new_zeros(batch, len(groups), height, width)
     counts = torch.zeros_like(sums)
+    noise = torch.zeros_like(sums)
     beside = codes.new_zeros(batch, NEAR, height, width)
     place = {offset: g for g, group in enumerate(groups) for offset in group}
     moving = [i for i, offset in enumerate(offsets) if offset]
@@ -148,14 +164,16 @@ def _group_sums(
     for first in range(0, len(moving), step):
         chosen = moving[first : first + step]
         frames = torch.stack([codes[:, i] for i in chosen], dim=1)
-        seen, inside = look(frames, found.path, [offsets[i] for i in chosen], 1, size, found.shake[:, chosen])
+        shake = found.shake[:, chosen]
+        seen, inside, kept = look_sharply(frames, found.path, [offsets[i] for i in chosen], size, shake)
         for n, i in enumerate(chosen):
             g = place[offsets[i]]
             counts[:, g] += inside[:, n]
             if g < NEAR:
                 beside[:, g] = seen[:, n]
             sums[:, g].addcmul_(seen[:, n], inside[:, n])
-    return sums, counts, beside
+            noise[:, g].addcmul_(kept[:, n], inside[:, n])
+    return Groups(sums, counts, noise, beside)
 
 
 def group_weights(
@@ -164,7 +182,7 @@ def group_weights(
     """Return the weights of groups [B, G, H, W], of which a frame has its own where it lies in the picture; the mean
     codes of groups; and the sum of weights and the mean code [B, H, W] of the nearest three frames.
 
-    The reference frame `alone` has the weight 1. The others are those of `_group_sums`.
+    The reference frame `alone` has the weight 1. The others are those of `Groups`.
     """
     # One picture of the variance serves all frames, or frames that happen to be dim would be trusted more.
     mean = (sums.sum(1) + alone) / (counts.sum(1) + 1)
@@ -185,9 +203,9 @@ def _weighted(alone: Tensor, weights: Tensor, sums: Tensor, counts: Tensor) -> t
     return total, (weights * sums).sum(1).add_(alone).div_(total)
 
 
-def _count(total: Tensor, weights: Tensor, counts: Tensor) -> Tensor:
-    """Return the number of equal weights with the same noise, [B, H, W]."""
-    return total.square().div_((weights.square() * counts).sum(1).add_(1))
+def _count(total: Tensor, weights: Tensor, noise: Tensor) -> Tensor:
+    """Return the number of codes whose mean has the noise of the merged frame, [B, H, W]."""
+    return total.square().div_((weights.square() * noise).sum(1).add_(1))
 
 
 def agreement(difference: Tensor, variance: Tensor) -> Tensor:

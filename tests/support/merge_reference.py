@@ -67,13 +67,38 @@ def kept_noise(moved: Tensor) -> Tensor:
     return share[0] * share[1]
 
 
+def cubic_weights(part: Tensor) -> Tensor:
+    """Return the four weights [4, ...] of the cubic kernel of Keys (1981) with a slope of -0.75, at places between the
+    second and the third pixel.
+    """
+    a = -0.75
+
+    def beside(x: Tensor) -> Tensor:
+        return ((a + 2) * x - (a + 3)) * x * x + 1
+
+    def beyond(x: Tensor) -> Tensor:
+        return ((a * x - 5 * a) * x + 8 * a) * x - 4 * a
+
+    return torch.stack([beyond(1 + part), beside(part), beside(1 - part), beyond(2 - part)])
+
+
+def kept_noise_of_cubic(moved: Tensor) -> Tensor:
+    """Return the share of the noise's variance [..., H, W] that is left at p + moved [2, ..., H, W], seen by `look` of
+    cubics.
+    """
+    share = cubic_weights(moved - moved.floor()).square().sum(0)
+    return share[0] * share[1]
+
+
 def displacement(velocity: Tensor, acceleration: Tensor, offset: int, scale: int = 1) -> Tensor:
     """Return where paths lead after `offset` frames, [2, H, W], in cells of a scale."""
     return (velocity * offset + acceleration * (offset * offset / 2)) / scale
 
 
-def look(image: Tensor, moved: Tensor, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
-    """Return an image [H, W] seen at p + moved [2, H, W], bilinear, and 1 where that lies inside, else 0.
+def look(
+    image: Tensor, moved: Tensor, size: tuple[int, int] | None = None, mode: str = "bilinear"
+) -> tuple[Tensor, Tensor]:
+    """Return an image [H, W] seen at p + moved [2, H, W], and 1 where that lies inside, else 0.
 
     Inside are the first rows and columns, `size` of them, of an image that was filled; None: all.
     """
@@ -83,7 +108,7 @@ def look(image: Tensor, moved: Tensor, size: tuple[int, int] | None = None) -> t
     x = torch.arange(width, dtype=image.dtype)[None] + moved[1]
     inside = (y >= -0.5) & (y <= rows - 0.5) & (x >= -0.5) & (x <= columns - 0.5)
     grid = torch.stack([x.mul_(2 / max(width - 1, 1)).sub_(1), y.mul_(2 / max(height - 1, 1)).sub_(1)], dim=-1)
-    seen = functional.grid_sample(image[None, None], grid[None], padding_mode="border", align_corners=True)
+    seen = functional.grid_sample(image[None, None], grid[None], mode=mode, padding_mode="border", align_corners=True)
     return seen[0, 0], inside.to(image.dtype)
 
 
@@ -405,7 +430,7 @@ class Merged:
     still: Array  # mean code of the window without motion
     frames: int  # in the window
     groups: Array  # [6, H, W], mean codes of GROUPS, moved and not weighted
-    group_counts: Array  # [6, H, W], frames of each that lie in the picture
+    group_counts: Array  # [6, H, W], codes whose mean has the noise of each; 0 without a frame in the picture
 
 
 @dataclass(frozen=True)
@@ -436,9 +461,12 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
         velocity, acceleration = paths(pyramid, offsets, codes, deviation)
         moved = torch.empty(len(window), *window[0].codes.shape)
         inside = torch.ones_like(moved)
+        kept = torch.ones_like(moved)
         for i, (frame, offset) in enumerate(zip(window, offsets, strict=True)):
             if offset:
-                moved[i], inside[i] = look(frame.codes, displacement(velocity, acceleration, offset), frame.size)
+                moves = displacement(velocity, acceleration, offset)
+                moved[i], inside[i] = look(frame.codes, moves, frame.size, "bicubic")
+                kept[i] = kept_noise_of_cubic(moves)
             else:
                 moved[i] = frame.codes
         weight = weights(moved, inside, offsets, domain)
@@ -448,14 +476,15 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
         groups = [[i for i, offset in enumerate(offsets) if offset in group] for group in GROUPS]
         counts = torch.stack([inside[group].sum(0) for group in groups])
         sums = torch.stack([(moved[group] * inside[group]).sum(0) for group in groups])
+        noise = torch.stack([(kept[group] * inside[group]).sum(0) for group in groups])
         return Merged(
-            *_weighted(moved, weight),
+            *_weighted(moved, weight, kept),
             alone,
-            *_weighted(moved[near], weight[near]),
+            *_weighted(moved[near], weight[near], kept[near]),
             still.numpy(),
             frames=len(window),
             groups=(sums / counts.clamp(min=1)).numpy(),
-            group_counts=counts.numpy(),
+            group_counts=torch.where(counts > 0, counts.square() / noise, 0.0).numpy(),
         )
 
 
@@ -465,10 +494,12 @@ def variance_of(mean_code: Tensor, domain: InformationDomain) -> Tensor:
     return torch.from_numpy(np.maximum(variance, FLOOR).astype(np.float32))
 
 
-def _weighted(moved: Tensor, weight: Tensor) -> tuple[Array, Array]:
-    """Return the weighted mean [H, W] of frames, and the number of equal weights with the same noise."""
+def _weighted(moved: Tensor, weight: Tensor, kept: Tensor) -> tuple[Array, Array]:
+    """Return the weighted mean [H, W] of frames that keep shares of their noise, and the number of codes whose mean has
+    its noise.
+    """
     total = weight.sum(0)
-    return ((moved * weight).sum(0) / total).numpy(), (total.square() / weight.square().sum(0)).numpy()
+    return ((moved * weight).sum(0) / total).numpy(), (total.square() / (weight.square() * kept).sum(0)).numpy()
 
 
 def weights(moved: Tensor, inside: Tensor, offsets: Sequence[int], domain: InformationDomain) -> Tensor:

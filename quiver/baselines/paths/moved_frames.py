@@ -6,7 +6,7 @@ the same frames may lie below each other: [B, 2, C * H, W].
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import torch
@@ -17,6 +17,7 @@ from quiver.device import is_gpu
 
 SCALES = (8, 4, 2)  # px of the full frame per cell, along one side
 CHUNK = 1 << 20  # cells that are followed at a time on a CPU, whose cache then holds them
+CUBIC = -0.75  # slope of the cubic kernel one pixel from its middle (Keys 1981), that of torch's sampling
 
 Path = tuple[Tensor, Tensor]  # velocity and acceleration [B, 2, h, w]
 
@@ -65,6 +66,25 @@ def kept_noise(moved: Tensor) -> Tensor:
     return share.select(-3, 0) * share.select(-3, 1)
 
 
+def kept_noise_of_cubic(moved: Tensor) -> Tensor:
+    """Return the share of the noise's variance [..., H, W] that is left at p + moved [..., 2, H, W], seen by
+    `look_sharply`.
+
+    With t the place between two pixels and u = t (1 - t), the four weights of the kernel are A u (1 - t) and A u t
+    outside; those inside have the sum S = 1 - A u and the difference D = (1 - 2t) (1 + (A + 2) u). The sum of their
+    squares, A^2 u^2 (1 - 2u) + (S^2 + D^2) / 2, has the coefficients below in u^2 and u^3; that of u is 0.
+    """
+    between = moved - moved.floor()
+    between = between.mul(1 - between)
+    share = (between * _CUBED).add_(_SQUARED).mul_(between.square_()).add_(1)
+    return share.select(-3, 0) * share.select(-3, 1)
+
+
+_B = CUBIC + 2
+_SQUARED = CUBIC**2 * 1.5 + _B**2 / 2 - 4 * _B
+_CUBED = -2 * CUBIC**2 - 2 * _B**2
+
+
 def look(
     frames: Tensor,
     path: Path,
@@ -79,7 +99,7 @@ def look(
     Inside are the first rows and columns, `size` of them, of frames that were filled; None: all. A `camera` moves what
     the paths reach: motion [B, K, 2, 3] of camera_motion.py.
     """
-    seen, inside, _ = _looked(frames, path, offsets, scale, size, camera, noise=False)
+    seen, inside, _ = _looked(frames, path, offsets, scale, size, camera, None)
     return seen, inside
 
 
@@ -87,7 +107,16 @@ def look_with_noise(
     frames: Tensor, path: Path, offsets: Sequence[int], scale: int, camera: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return what `look` does, and the share of the noise's variance that is left there, [B, K, C * h, w]."""
-    seen, inside, kept = _looked(frames, path, offsets, scale, None, camera, noise=True)
+    seen, inside, kept = _looked(frames, path, offsets, scale, None, camera, kept_noise)
+    assert kept is not None
+    return seen, inside, kept
+
+
+def look_sharply(
+    frames: Tensor, path: Path, offsets: Sequence[int], size: tuple[int, int], camera: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what `look` does at full size, by cubics, and the share of the noise's variance that is left there."""
+    seen, inside, kept = _looked(frames, path, offsets, 1, size, camera, kept_noise_of_cubic, "bicubic")
     assert kept is not None
     return seen, inside, kept
 
@@ -107,8 +136,10 @@ def _looked(
     scale: int,
     size: tuple[int, int] | None,
     camera: Tensor | None,
-    noise: bool,
+    kept: Callable[[Tensor], Tensor] | None,
+    mode: str = "bilinear",
 ) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return what `look` does with this interpolation, and what `kept` says of the places, None without it."""
     batch, count, height, width = frames.shape
     velocity, acceleration = (field.flip(1)[:, None] / scale for field in path)  # (right, down), as grids have it
     rows = velocity.shape[-2]
@@ -123,21 +154,21 @@ def _looked(
         place = velocity * times[0, part]
         place += acceleration * times[1, part]
         if camera is None:
-            if noise:
-                found[2].append(kept_noise(place))
+            if kept is not None:
+                found[2].append(kept(place))
             place += first
         else:
             place += first
             place = _led(camera[:, part] / scale, place)
-            if noise:
-                found[2].append(kept_noise(place))
+            if kept is not None:
+                found[2].append(kept(place))
         found[1].append(_within(place[:, :, 0], last[1]).mul_(_within(place[:, :, 1], last[0])))
         grid = place.mul_(unit).sub_(1).flatten(0, 1).permute(0, 2, 3, 1)
         images = frames[:, part].reshape(-1, 1, height, width)
-        seen = functional.grid_sample(images, grid, padding_mode="border", align_corners=True)
+        seen = functional.grid_sample(images, grid, mode=mode, padding_mode="border", align_corners=True)
         found[0].append(seen.view(batch, -1, rows, width))
     seen, inside = (_joined(parts) for parts in found[:2])
-    return seen, inside, _joined(found[2]) if noise else None
+    return seen, inside, _joined(found[2]) if found[2] else None
 
 
 def _led(camera: Tensor, place: Tensor) -> Tensor:
