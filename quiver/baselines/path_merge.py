@@ -39,6 +39,10 @@ from quiver.baselines.paths.moved_frames import CHUNK, SCALES, box_mean, enlarge
 from quiver.baselines.sliding_window import check_window, checked_codes, equal_windows, in_units
 from quiver.device import is_gpu
 
+# places of frames in the window -> those frames [B, N, H, W] seen where each pixel went, 1 where that lies in the
+# picture, else 0, and the share of the noise's variance that is left there
+Follow = Callable[[Sequence[int]], tuple[Tensor, Tensor, Tensor]]
+
 # (cells of 2 x 2 px beside the own one whose mean difference is squared, and over which squares are averaged; statistic
 # up to which frames agree; excess over it at which a frame has half its weight)
 STATISTICS = ((1, 1, 3.0, 1.0), (0, 2, 1.6, 0.25))
@@ -122,12 +126,23 @@ def merge(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Mer
     return merge_along(window, offsets, tables, moves(window.pyramid, offsets, pooled, deviation))
 
 
-@torch.no_grad()
 def merge_along(window: Prepared, offsets: Sequence[int], tables: DomainTables, found: Moves) -> Merged:
     """Return the reference frames of windows [B, K, H, W], merged along motions that are known."""
+
+    def follow(places: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+        frames = torch.stack([window.codes[:, i] for i in places], dim=1)
+        times = [offsets[i] for i in places]
+        return look_sharply(frames, found.path, times, window.size, found.shake[:, places])
+
+    return merge_followed(window, offsets, tables, follow)
+
+
+@torch.no_grad()
+def merge_followed(window: Prepared, offsets: Sequence[int], tables: DomainTables, follow: Follow) -> Merged:
+    """Return the reference frames of windows [B, K, H, W], merged with the others as they are seen by `follow`."""
     codes = window.codes
     alone = codes[:, offsets.index(0)]
-    groups = _groups(codes, found, offsets, window.size)
+    groups = _groups(codes, offsets, follow)
     weights, means, near_total, near_mean = group_weights(alone, groups.sums, groups.counts, groups.beside, tables)
     total, mean_code = _weighted(alone, weights, groups.sums, groups.counts)
     shown = slice(len(GROUPS))
@@ -150,8 +165,8 @@ def groups_of(offsets: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     return GROUPS + tuple((2 * side * n, side * (2 * n + 1)) for n in range(3, last + 1) for side in (-1, 1))
 
 
-def _groups(codes: Tensor, found: Moves, offsets: Sequence[int], size: tuple[int, int]) -> Groups:
-    """Return the sums of the frames of windows of codes [B, K, H, W], moved; `size` is that of a frame in them."""
+def _groups(codes: Tensor, offsets: Sequence[int], follow: Follow) -> Groups:
+    """Return the sums of the frames of windows of codes [B, K, H, W], moved."""
     batch, _, height, width = codes.shape
     groups = groups_of(offsets)
     sums = codes.new_zeros(batch, len(groups), height, width)
@@ -163,9 +178,7 @@ def _groups(codes: Tensor, found: Moves, offsets: Sequence[int], size: tuple[int
     step = len(offsets) if is_gpu(codes.device) else max(1, CHUNK // (batch * height * width))
     for first in range(0, len(moving), step):
         chosen = moving[first : first + step]
-        frames = torch.stack([codes[:, i] for i in chosen], dim=1)
-        shake = found.shake[:, chosen]
-        seen, inside, kept = look_sharply(frames, found.path, [offsets[i] for i in chosen], size, shake)
+        seen, inside, kept = follow(chosen)
         for n, i in enumerate(chosen):
             g = place[offsets[i]]
             counts[:, g] += inside[:, n]

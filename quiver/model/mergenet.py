@@ -1,6 +1,6 @@
 """Defines MergeNet, our restorer of one frame from merged frames: one set of weights for every light, depth and sensor.
 
-    channels [N, 13, H, W] in units of the noise -> U-Net, widths 40, 80, 160 -> correction [N, 1, H, W], the same unit
+    channels [N, 17, H, W] in units of the noise -> U-Net, widths 40, 80, 160 -> correction [N, 1, H, W], the same unit
 
 The frame restored is merged phi + deviation x correction. On the scale phi all sensors look alike: the noise of n codes
 has the deviation 1 / sqrt(n), and the signal is between one and a hundred of them. So one network sees every bit
@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from quiver.model.blocks import conv
 from quiver.model.config import NetworkConfig, whole_number
 
-INPUTS = 13  # channels, of quiver/restoration/merge_inputs.py
+INPUTS = 17  # channels, of quiver/restoration/merge_inputs.py
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """Prepares the inputs of MergeNet: merged frames on the scale phi, in units of their noise, with maps of what is known.
 
-    Merged (path_merge.py) -> phi (information_domain.py) -> channels [B, 13, H, W] -> MergeNet -> phi again -> photons
+    Merged (path_merge.py) -> phi (information_domain.py) -> channels [B, 17, H, W] -> MergeNet -> phi again -> photons
 
 All channels describe a pixel and its near surroundings; none depends on the size of the frame. They are made where the
-merged frames are, for a batch of windows at once.
+merged frames are, for a batch of windows at once. Four tell what looks alike near by (self_similarity.py).
 """
 
 from __future__ import annotations
@@ -18,12 +18,14 @@ from quiver.baselines.domain_tables import DomainTables, domain_tables, tables_o
 from quiver.baselines.information_domain import InformationDomain, information_domain
 from quiver.baselines.path_merge import Merged, as_codes, merge, prepared
 from quiver.baselines.paths.moved_frames import box_mean
+from quiver.baselines.self_similarity import mean_of_alike
 from quiver.data.codes import Codes, Sensor
 
 LOCAL = 8  # px: half the side of the squares whose mean code tells the local level
 NEARBY = 2  # px, likewise, of the level around a pixel, and of the noise of groups
 UNIT = 4.0  # deviations of the noise that a channel's 1 stands for
-MOST = 4.0  # of a channel of a group: a frame of another scene tells no more
+MOST = 4.0  # of a channel of a group, and of what looks alike: another scene tells no more
+ALIKE = 4  # channels of what looks alike
 LEAST_LIGHT = 1e-3  # photons, added to light before it is compared with its noise
 
 
@@ -31,7 +33,7 @@ LEAST_LIGHT = 1e-3  # photons, added to light before it is compared with its noi
 class MergeInputs:
     """Inputs of one frame of each window, float32."""
 
-    channels: Tensor  # [B, 13, H, W]
+    channels: Tensor  # [B, 17, H, W]
     phi: Tensor  # [B, H, W], of the merged mean code
     deviation: Tensor  # [B, H, W], of the noise of phi
 
@@ -69,11 +71,12 @@ def merge_inputs(merged: Merged, tables: DomainTables) -> MergeInputs:
     Channels: the merged phi over its local level; the frame alone, the nearest three, the unmoved window and the level
     around the pixel over the merged phi, each in units of its noise; the deviation of the noise; the logarithm of the
     light over its noise, which is low where codes carry nothing; and six groups of moved frames over the merged frame,
-    in units of their noise, which tell what merging left out. Levels are phi of pooled codes: phi of single pixels
-    loses light near saturation.
+    in units of their noise, which tell what merging left out; what looks alike in the merged frame and in the frame
+    alone. Levels are phi of pooled codes: phi of single pixels loses light near saturation.
     """
     phi, deviation = tables.stabilised(merged.mean_code, merged.count)
-    channels = phi.new_empty(len(phi), 7 + merged.groups.shape[1], *phi.shape[1:])
+    groups = merged.groups.shape[1]
+    channels = phi.new_empty(len(phi), 7 + groups + ALIKE, *phi.shape[1:])
     local = tables.phi(box_mean(merged.mean_code, LOCAL))
     own = (deviation * UNIT).reciprocal_()
     torch.mul(phi - local, own, out=channels[:, 0])
@@ -89,7 +92,8 @@ def merge_inputs(merged: Merged, tables: DomainTables) -> MergeInputs:
     # Light over its noise, in octaves: it tells the network where codes are dark or saturated.
     known = light.add_(LEAST_LIGHT).div_(slope.mul_(deviation).add_(LEAST_LIGHT)).log2_().clamp_(-4, 8)
     torch.div(known, UNIT, out=channels[:, 6])
-    _groups(merged, around, tables, out=channels[:, 7:])
+    _groups(merged, around, tables, out=channels[:, 7 : 7 + groups])
+    _alike(merged, phi, deviation, tables, out=channels[:, 7 + groups :])
     return MergeInputs(channels, phi, deviation)
 
 
@@ -98,3 +102,14 @@ def _groups(merged: Merged, around: Tensor, tables: DomainTables, out: Tensor) -
     torch.sub(merged.groups, merged.mean_code[:, None], out=out)
     noise = tables.variance(around).rsqrt_().div_(UNIT)
     out.mul_(merged.group_counts.sqrt()).mul_(noise[:, None]).clamp_(-MOST, MOST)
+
+
+def _alike(merged: Merged, phi: Tensor, deviation: Tensor, tables: DomainTables, out: Tensor) -> None:
+    """Write what looks alike in the merged frame and in the frame alone, [B, 4, H, W]: each over the merged frame in
+    units of its noise, and the octaves by which it has less noise.
+    """
+    alone, noise = tables.stabilised(merged.alone, 1.0)
+    means, variances = mean_of_alike(torch.cat([phi, alone]), torch.cat([deviation, noise]).square_())
+    for i, (mean, variance) in enumerate(zip(means.chunk(2), variances.chunk(2), strict=True)):
+        torch.div(mean - phi, deviation * UNIT, out=out[:, 2 * i]).clamp_(-MOST, MOST)
+        torch.div(deviation.square().div_(variance).log2_(), 2 * UNIT, out=out[:, 2 * i + 1])

@@ -564,13 +564,17 @@ NEARBY = 2  # px, likewise, of the level around a pixel, and of the noise of gro
 UNIT = 4.0  # deviations of the noise that a channel's 1 stands for
 MOST = 4.0  # of a channel of a group: a frame of another scene tells no more
 LEAST_LIGHT = 1e-3  # photons, added to light before it is compared with its noise
+REACH = 16  # px within which places are looked for that look alike, by even shifts
+AROUND = 1  # cells of 2 x 2 px beside the own one that are compared
+TOLERANCE = 1.25  # mean square of differences over their variance up to which places look alike
+SOFTNESS = 0.15  # excess over it at which a place has a quarter of its weight
 
 
 @dataclass(frozen=True)
 class MergeInputs:
     """Inputs of one frame, float32."""
 
-    channels: Tensor  # [13, H, W]
+    channels: Tensor  # [17, H, W]
     phi: Tensor  # [H, W], of the merged mean code
     deviation: Tensor  # [H, W], of the noise of phi
 
@@ -581,8 +585,8 @@ def merge_inputs(merged: Merged, domain: InformationDomain) -> MergeInputs:
     Channels: the merged phi over its local level; the frame alone, the nearest three, the unmoved window and the level
     around the pixel over the merged phi, each in units of its noise; the deviation of the noise; the logarithm of the
     light over its noise, which is low where codes carry nothing; and six groups of moved frames over the merged frame,
-    in units of their noise, which tell what merging left out. Levels are phi of pooled codes: phi of single pixels
-    loses light near saturation.
+    in units of their noise, which tell what merging left out; what looks alike in the merged frame and in the frame
+    alone. Levels are phi of pooled codes: phi of single pixels loses light near saturation.
     """
     phi, deviation = _stabilised(merged.mean_code, merged.count, domain)
     alone, alone_deviation = _stabilised(merged.alone, np.ones_like(merged.alone), domain)
@@ -603,6 +607,8 @@ def merge_inputs(merged: Merged, domain: InformationDomain) -> MergeInputs:
         deviation,
         known,
         *_groups(merged, around, domain),
+        *_alike(phi, deviation, phi, deviation),
+        *_alike(alone, alone_deviation, phi, deviation),
     ]
     stacked = np.stack(channels, dtype=np.float32, casting="same_kind")
     return MergeInputs(torch.from_numpy(stacked), torch.from_numpy(phi), torch.from_numpy(deviation))
@@ -614,6 +620,39 @@ def _groups(merged: Merged, around: Array, domain: InformationDomain) -> Array:
     apart = (merged.groups - merged.mean_code) * np.sqrt(merged.group_counts / variance) / UNIT
     found: Array = apart.clip(-MOST, MOST)
     return found
+
+
+def _alike(image: Array, noise: Array, phi: Array, deviation: Array) -> list[Array]:
+    """Return what looks alike in an image [H, W] over phi, in units of its noise, and the octaves of less noise."""
+    mean, variance = mean_of_alike(image, np.square(noise))
+    apart = ((mean - phi) / (UNIT * deviation)).clip(-MOST, MOST)
+    return [apart, np.log2(np.square(deviation) / variance) / (2 * UNIT)]
+
+
+def mean_of_alike(image: Array, variance: Array) -> tuple[Array, Array]:
+    """Return the mean [H, W] of the places of an image [H, W] that look alike, and its variance, place by place."""
+    height, width = image.shape
+    of_cells = variance.reshape(height // 2, 2, width // 2, 2).mean((1, 3)).repeat(2, 0).repeat(2, 1)
+    total = np.ones_like(image)
+    squares = of_cells.copy()
+    sums = image.copy()
+    for down in range(-REACH, REACH + 1, 2):
+        rows = np.arange(max(0, -down), min(height, height - down))
+        for right in range(-REACH, REACH + 1, 2):
+            here = np.ix_(rows, np.arange(max(0, -right), min(width, width - right)))
+            if (down, right) == (0, 0) or not image[here].size:
+                continue
+            there = here[0] + down, here[1] + right
+            square = np.square(image[here] - image[there])
+            cells = square.reshape(square.shape[0] // 2, 2, square.shape[1] // 2, 2).mean((1, 3))
+            unit = (of_cells[here] + of_cells[there])[::2, ::2]
+            statistic = box_mean(torch.from_numpy(cells / unit)[None], AROUND)[0].numpy()
+            weight = 1 / (1 + np.maximum(statistic - TOLERANCE, 0) / SOFTNESS) ** 2
+            weight = weight.repeat(2, 0).repeat(2, 1)
+            total[here] += weight
+            squares[here] += np.square(weight) * of_cells[there]
+            sums[here] += weight * image[there]
+    return sums / total, squares / np.square(total)
 
 
 def _stabilised(mean_code: Array, count: Array, domain: InformationDomain) -> tuple[Array, Array]:

@@ -65,7 +65,7 @@ def test_a_weights_file_comes_back(tmp_path):
     [
         ({"width": 0}, "must be a whole number"),
         ({"width": 1.5}, "must be a whole number"),
-        ({"inputs": 5}, "inputs is 5, this version prepares 13; train such weights again"),
+        ({"inputs": 5}, "inputs is 5, this version prepares 17; train such weights again"),
     ],
 )
 def test_a_wrong_configuration_is_refused(values, told):

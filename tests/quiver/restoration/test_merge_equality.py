@@ -96,16 +96,21 @@ def test_windows_of_a_batch_are_merged_as_if_alone():
 @pytest.mark.parametrize("device", ["cpu", "meta"])
 def test_a_batch_takes_the_operators_of_a_window_and_waits_for_nothing(device):
     """Tensors without values can answer no question: where something depended on them, the meta device would raise."""
-    counts = []
     tables = domain_tables(information_domain(quiver_physical(3.25), EXPOSURE), torch.device(device))
-    for batch in (1, 8):
-        codes = torch.zeros(batch, 11, 40, 48, dtype=torch.uint8, device=device)
-        inputs_of_windows(codes, tables)  # makes what is kept for this size
-        with Operators() as operators:
-            inputs_of_windows(codes, tables)
-        assert not operators.waits
-        counts.append(operators.count)
-    assert counts[0] == counts[1]
+
+    def merged(codes):
+        return pm.merge(pm.prepared(codes, tables), range(-5, 6), tables)
+
+    for run in (lambda codes: inputs_of_windows(codes, tables), merged):
+        counts = []
+        for batch in (1, 8):
+            codes = torch.zeros(batch, 11, 40, 48, dtype=torch.uint8, device=device)
+            run(codes)  # makes what is kept for this size
+            with Operators() as operators:
+                run(codes)
+            assert not operators.waits
+            counts.append(operators.count)
+        assert counts[0] == counts[1]
     with Operators() as one_by_one:
         codes = np.zeros((11, 40, 48), np.uint8)
         plain_merge(codes, information_domain(quiver_physical(3.25), EXPOSURE), 5)

@@ -50,7 +50,8 @@ def test_noise_is_one_unit_whatever_the_sensor(sensor, photons):
     assert noise == pytest.approx(1, abs=0.15)  # 11 codes: the delta method errs by 0.85 to 1.15
     assert not inputs.channels[2:4].any()
     assert inputs.channels[1].any()
-    for channel, group in zip(inputs.channels[7:], GROUPS, strict=True):  # the merged frame holds the group, too
+    of_groups = inputs.channels[7 : 7 + len(GROUPS)]
+    for channel, group in zip(of_groups, GROUPS, strict=True):  # the merged frame holds the group, too
         assert float(channel.std()) * UNIT == pytest.approx(np.sqrt(1 - len(group) / 11), abs=0.1)
 
 
@@ -79,10 +80,27 @@ def test_groups_without_a_frame_tell_nothing():
     sensor = QIS(0.8, 1.6, 0.2, 3)
     domain = information_domain(sensor, EXPOSURE)
     merged = next(stream(lambda t: codes[t], 3, domain, 11, range(1)))
-    assert merged.group_counts.amax((2, 3))[0].tolist() == [0, 1, 0, 1, 0, 0]
-    channels = merge_inputs(merged, domain).channels[7:]
+    there = [False, True, False, True, False, False]
+    assert (merged.group_counts.amax((2, 3)) > 0)[0].tolist() == there
+    channels = merge_inputs(merged, domain).channels[7 : 7 + len(GROUPS)]
     assert not channels[[0, 2, 4, 5]].any()
     assert channels[1].any()
+
+
+def test_what_looks_alike_is_told_with_its_noise():
+    """Still stripes: over the merged frame, what looks alike differs by the noise of the merged frame alone."""
+    sensor = QIS(0.8, 1.6, 0.2, 6)
+    light = np.broadcast_to(np.where(np.arange(64) // 2 % 2, 40.0, 16.0), (11, 64, 64))
+    codes = sensor.sample(light, EXPOSURE, key=Key(0, 2), engine="reference")
+    domain = information_domain(sensor, EXPOSURE)
+    inputs = merge_inputs(mean_of(codes), domain)
+    of_merged, fewer, of_alone, fewer_than_alone = inputs.channels[7 + len(GROUPS) :]
+    truth = domain.forward(sensor.mean(light[0], EXPOSURE))
+    for channel, octaves, share in ((of_merged, fewer, 0.25), (of_alone, fewer_than_alone, 0.6)):
+        restored = inputs.phi + channel * UNIT * inputs.deviation
+        stated = inputs.deviation * 2.0 ** (-UNIT * octaves)
+        assert np.median(np.abs(restored - truth)) < share * np.median(np.abs(inputs.phi - truth))
+        assert np.median(stated) < share * np.median(inputs.deviation)
 
 
 @pytest.mark.parametrize("level", ["dark", "saturated"])
