@@ -111,7 +111,7 @@ def merges(clip: Clip, codes: Array, tables: DomainTables) -> dict[str, Merged]:
     """Return the merged frame MIDDLE of a clip by each of MOTIONS; `codes` are [T, H, W]."""
     offsets = range(-REACH, REACH + 1)
     frames = torch.from_numpy(codes[MIDDLE - REACH : MIDDLE + REACH + 1])[None]
-    window = path_merge.prepared(frames, tables)
+    window = path_merge.evened(path_merge.prepared(frames, tables), offsets, tables)
     shape = window.codes.shape
     still = Moves((torch.zeros(1, 2, *shape[-2:]),) * 2, torch.zeros(1, len(offsets), 2, 3))
     true = followed(window, offsets, true_moves(clip, MIDDLE, REACH))

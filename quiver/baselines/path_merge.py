@@ -12,6 +12,9 @@ of a stream need no invented frames.
 The count of a pixel is the number of codes whose mean has its noise: (sum of weights)^2 over the sum of squared weights
 times the share of the noise that is left where a moved frame is sampled between its pixels.
 
+Light that changes for all of a picture is evened out first (paths/light_factors.py): codes of a frame are scaled to the
+light of the reference, and count by the information that they have about it.
+
 A batch of windows is merged at once, on any device; nothing waits for the host. Frames of a group share their weight,
 so sums of a group's frames are all that is kept of them.
 
@@ -34,7 +37,8 @@ from torch import Tensor
 from qsim.sensor.sensor import Sensor
 from quiver.baselines.domain_tables import DomainTables, domain_tables
 from quiver.baselines.information_domain import InformationDomain, information_domain
-from quiver.baselines.paths.motion_paths import Moves, moves
+from quiver.baselines.paths.light_factors import light_factors
+from quiver.baselines.paths.motion_paths import Moves, moves, none_of
 from quiver.baselines.paths.moved_frames import CHUNK, SCALES, box_mean, enlarged, halved, look_sharply
 from quiver.baselines.sliding_window import check_window, checked_codes, equal_windows, in_units
 from quiver.device import is_gpu
@@ -48,6 +52,7 @@ Follow = Callable[[Sequence[int]], tuple[Tensor, Tensor, Tensor]]
 STATISTICS = ((1, 1, 3.0, 1.0), (0, 2, 1.6, 0.25))
 GROUPS = ((-1,), (1,), (-2, -3), (2, 3), (-4, -5), (4, 5))  # offsets of the frames that `Merged.groups` averages
 PIXEL_BYTES = 3_000  # that a pixel of a window takes on a GPU, where all frames and velocities are tried at a time
+MOST_SHARE = 2.0  # of a frame in brighter light than the reference; saturated codes would seem to tell everything
 LEAST_NOISE = 0.1  # of a group of frames; a cubic leaves a frame half of its noise
 NEAR = 2  # groups of one frame beside the reference; the other frames are compared with the mean of these three
 
@@ -84,6 +89,7 @@ class Prepared:
     codes: Tensor
     pyramid: dict[int, Tensor]
     size: tuple[int, int]  # of a frame before it was filled
+    shares: Tensor | None = None  # [B, K], codes of the reference that tell as much as one of a frame; None: 1
 
 
 def prepared(codes: Tensor, tables: DomainTables) -> Prepared:
@@ -119,11 +125,26 @@ def _windows(images: Sequence[Tensor], count: int) -> Tensor:
 @torch.no_grad()
 def merge(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Merged:
     """Return the merged reference frames of windows [B, K, H, W]; `offsets` are the frames' places in time, with 0."""
-    codes = window.codes
-    pooled = halved(codes)
+    window = evened(window, offsets, tables)
+    pooled = halved(window.codes)
     # The noise that the search for paths expects, from the window without motion: only its size matters there.
     deviation = tables.variance(box_mean(pooled.mean(1), 2)).sqrt()
     return merge_along(window, offsets, tables, moves(window.pyramid, offsets, pooled, deviation))
+
+
+def evened(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Prepared:
+    """Return windows [B, K, H, W] whose frames have the light of the reference, and the shares of their codes."""
+    centre = offsets.index(0)
+    coarse = functional.avg_pool2d(window.codes, SCALES[0])
+    of_phi, of_codes = light_factors(window.pyramid[SCALES[0]], coarse, centre)
+    if none_of(of_codes != 1):
+        return window
+    # Of codes that are scaled by 1 / f, the variance is that of codes in f times the light, over f^2.
+    level = coarse[:, centre].mean((1, 2))[:, None, None]
+    variance = tables.variance(of_codes[:, None] * level) / of_codes[:, None].square()
+    shares = (tables.variance(level) / variance)[:, 0].clamp(max=MOST_SHARE)
+    pyramid = {scale: phi / of_phi[..., None, None] for scale, phi in window.pyramid.items()}
+    return Prepared(window.codes / of_codes[..., None, None], pyramid, window.size, shares)
 
 
 def merge_along(window: Prepared, offsets: Sequence[int], tables: DomainTables, found: Moves) -> Merged:
@@ -142,7 +163,7 @@ def merge_followed(window: Prepared, offsets: Sequence[int], tables: DomainTable
     """Return the reference frames of windows [B, K, H, W], merged with the others as they are seen by `follow`."""
     codes = window.codes
     alone = codes[:, offsets.index(0)]
-    groups = _groups(codes, offsets, follow)
+    groups = _groups(window, offsets, follow)
     weights, means, near_total, near_mean = group_weights(alone, groups.sums, groups.counts, groups.beside, tables)
     total, mean_code = _weighted(alone, weights, groups.sums, groups.counts)
     shown = slice(len(GROUPS))
@@ -152,7 +173,7 @@ def merge_followed(window: Prepared, offsets: Sequence[int], tables: DomainTable
         alone,
         near_mean,
         _count(near_total, weights[:, :NEAR], groups.noise[:, :NEAR]),
-        codes.sum(1).div_(len(offsets)),
+        _still(window),
         frames=len(offsets),
         groups=means[:, shown],
         group_counts=groups.counts[:, shown].square().div_(groups.noise[:, shown].clamp(min=LEAST_NOISE)),
@@ -165,8 +186,17 @@ def groups_of(offsets: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     return GROUPS + tuple((2 * side * n, side * (2 * n + 1)) for n in range(3, last + 1) for side in (-1, 1))
 
 
-def _groups(codes: Tensor, offsets: Sequence[int], follow: Follow) -> Groups:
-    """Return the sums of the frames of windows of codes [B, K, H, W], moved."""
+def _still(window: Prepared) -> Tensor:
+    """Return the mean codes [B, H, W] of windows without motion."""
+    if window.shares is None:
+        return window.codes.sum(1).div_(window.codes.shape[1])
+    shares = window.shares / window.shares.sum(1, keepdim=True)
+    return (window.codes * shares[..., None, None]).sum(1)
+
+
+def _groups(window: Prepared, offsets: Sequence[int], follow: Follow) -> Groups:
+    """Return the sums of the frames of windows [B, K, H, W], moved."""
+    codes = window.codes
     batch, _, height, width = codes.shape
     groups = groups_of(offsets)
     sums = codes.new_zeros(batch, len(groups), height, width)
@@ -179,6 +209,9 @@ def _groups(codes: Tensor, offsets: Sequence[int], follow: Follow) -> Groups:
     for first in range(0, len(moving), step):
         chosen = moving[first : first + step]
         seen, inside, kept = follow(chosen)
+        if window.shares is not None:
+            # A frame that counts c times has c times the codes in a sum, and c times the noise of one code.
+            inside = inside * window.shares[:, chosen, None, None]
         for n, i in enumerate(chosen):
             g = place[offsets[i]]
             counts[:, g] += inside[:, n]
@@ -200,10 +233,10 @@ def group_weights(
     # One picture of the variance serves all frames, or frames that happen to be dim would be trusted more.
     mean = (sums.sum(1) + alone) / (counts.sum(1) + 1)
     variance = tables.variance(box_mean(halved(mean), 1))[:, None]
-    near = agreement(beside - alone[:, None], 2 * variance)
+    most = torch.where(counts > 0, counts, 1.0)
+    near = agreement(beside - alone[:, None], variance * halved(1 + most[:, :NEAR].reciprocal()))
     # Far frames are compared with the mean of the nearest three, which has less noise than the reference alone.
     total, base = _weighted(alone, near, sums[:, :NEAR], counts[:, :NEAR])
-    most = counts.clamp(min=1)
     means = sums / most
     share = halved(most[:, NEAR:].reciprocal()).add_(halved(total.reciprocal())[:, None])
     far = agreement(means[:, NEAR:] - base[:, None], share.mul_(variance))

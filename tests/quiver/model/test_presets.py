@@ -17,7 +17,7 @@ def test_the_published_sizes_to_the_last_parameter():
 
 
 def test_the_control_has_the_size_of_our_network():
-    assert sum(p.numel() for p in build("mergenet").parameters()) == 913_241
+    assert sum(p.numel() for p in build("mergenet").parameters()) == 914_681
     assert sum(p.numel() for p in UNet().parameters()) == 911_841
 
 
