@@ -72,7 +72,7 @@ class Places(Dataset[dict[str, Any]]):
             none = np.zeros((windows.settings.crop, windows.settings.crop), bool)
             found[FILL] = fill_of(none if bad is None else bad, windows.seen_by(place)[0])
         if windows.prepare is seen_by:
-            found |= stated(*windows.seen_by(place))
+            found |= stated(*windows.seen_by(place), n)
         return found
 
 

@@ -20,14 +20,15 @@ class SeenBy:
     sensor: Sensor
     exposure: float  # s
     white: float  # photons
+    sample: int  # number of the window
 
 
-def seen_by(codes: Codes) -> dict[str, Any]:
+def seen_by(codes: Codes, sample: int) -> dict[str, Any]:
     """Return the sensor of a window, in place of inputs: those are made of the complete batch."""
-    return stated(codes.sensor, codes.exposure)
+    return stated(codes.sensor, codes.exposure, sample)
 
 
-def stated(sensor: Sensor, exposure: float) -> dict[str, Any]:
+def stated(sensor: Sensor, exposure: float, sample: int) -> dict[str, Any]:
     """Return what `seen_by` does of codes of this sensor and exposure [s]."""
     top = torch.tensor(sensor.levels - 1, dtype=torch.float32)
-    return {SENSORS: SeenBy(sensor, exposure, sensor.white(exposure)), TOP: top}
+    return {SENSORS: SeenBy(sensor, exposure, sensor.white(exposure), sample), TOP: top}

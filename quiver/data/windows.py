@@ -53,7 +53,7 @@ from quiver.host import own_numbers
 
 # Computes inputs of a network from the codes of a window: name -> tensor, each the same shape for all windows. It runs
 # where samples are drawn, in worker processes too, and gets no gradients; it is a function of a module, not a lambda.
-Prepare = Callable[[Codes], Mapping[str, torch.Tensor]]
+Prepare = Callable[[Codes, int], Mapping[str, torch.Tensor]]  # (codes of a window, its number)
 
 # stages of the random keys: no two uses share noise (0 is `qsim sense`)
 TRAINING = 1
@@ -332,7 +332,7 @@ class Windows(Dataset[dict[str, Any]]):
         if self.prepare is None:
             return sample
         seen = array_codes(codes, behind, exposure, name=clip.name)
-        return sample | dict(self.prepare(replace(seen, ppp=level, shares=shares, colour=self.filters)))
+        return sample | dict(self.prepare(replace(seen, ppp=level, shares=shares, colour=self.filters), n))
 
     def seen_by(self, place: WindowPlace) -> tuple[Sensor, float]:
         """Return the sensor of the filled codes of a window, and their exposure [s]."""

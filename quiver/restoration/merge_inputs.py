@@ -37,30 +37,59 @@ class MergeInputs:
     phi: Tensor  # [B, H, W], of the merged mean code
     deviation: Tensor  # [B, H, W], of the noise of phi
 
+    def taken(self, places: Sequence[int]) -> MergeInputs:
+        """Return the inputs of these windows."""
+        return MergeInputs(*(torch.stack([x[i] for i in places]) for x in (self.channels, self.phi, self.deviation)))
+
     def cut(self, height: int, width: int) -> MergeInputs:
         """Return the first rows and columns."""
         return MergeInputs(*(x[..., :height, :width] for x in (self.channels, self.phi, self.deviation)))
 
 
-def middle_inputs(codes: Codes) -> tuple[MergeInputs, InformationDomain]:
-    """Return the inputs of the middle frame of a window of codes, cut to its size, and the tables of its sensor."""
+def middle_inputs(codes: Codes, kept: tuple[int, int] | None = None) -> tuple[MergeInputs, InformationDomain]:
+    """Return the inputs of the middle frame of a window of codes, cut to its size, and the tables of its sensor.
+
+    The window `kept` so many frames before and after the middle one; None: all.
+    """
     domain = information_domain(codes.sensor, codes.exposure)
     window = as_codes(codes.read(0, codes.shape[0])[None], torch.device("cpu"))
-    return inputs_of_windows(window, domain_tables(domain, window.device)), domain
+    return inputs_of_windows(window, domain_tables(domain, window.device), kept), domain
 
 
-def batch_inputs(codes: Tensor, sensors: Sequence[tuple[Sensor, float]]) -> tuple[MergeInputs, list[InformationDomain]]:
+def batch_inputs(
+    codes: Tensor, sensors: Sequence[tuple[Sensor, float]], kept: Sequence[tuple[int, int]]
+) -> tuple[MergeInputs, list[InformationDomain]]:
     """Return the inputs of the middle frames of windows of codes [B, K, H, W] where the codes are, and the tables of
-    the sensor and exposure [s] of each window.
+    the sensor and exposure [s] of each window, which `kept` so many frames before and after the middle one.
     """
     domains = [information_domain(sensor, exposure) for sensor, exposure in sensors]
-    return inputs_of_windows(codes, tables_of_batch(domains, codes.device)), domains
+    parts: list[MergeInputs] = []
+    order: list[int] = []
+    for each in sorted(set(kept)):  # windows of equal length are merged together
+        places = [i for i, own in enumerate(kept) if own == each]
+        tables = tables_of_batch([domains[i] for i in places], codes.device)
+        parts.append(inputs_of_windows(torch.stack([codes[i] for i in places]), tables, each))
+        order += places
+    return joined(parts).taken([order.index(i) for i in range(len(order))]), domains
 
 
-def inputs_of_windows(codes: Tensor, tables: DomainTables) -> MergeInputs:
-    """Return the inputs of the middle frames of windows of codes [B, K, H, W], where the codes are."""
+def joined(parts: Sequence[MergeInputs]) -> MergeInputs:
+    """Return the inputs of all windows of some batches."""
+    fields = zip(*((part.channels, part.phi, part.deviation) for part in parts), strict=True)
+    return MergeInputs(*(torch.cat(tensors) for tensors in fields))
+
+
+def inputs_of_windows(codes: Tensor, tables: DomainTables, kept: tuple[int, int] | None = None) -> MergeInputs:
+    """Return the inputs of the middle frames of windows of codes [B, K, H, W], where the codes are.
+
+    The windows `kept` so many frames before and after the middle one; None: all.
+    """
     frames, height, width = codes.shape[1:]
-    offsets = range(-(frames // 2), frames - frames // 2)
+    middle = frames // 2
+    before = middle if kept is None else min(kept[0], middle)
+    after = frames - 1 - middle if kept is None else min(kept[1], frames - 1 - middle)
+    offsets = range(-before, after + 1)
+    codes = codes[:, middle - before : middle + after + 1]
     return merge_inputs(merge(prepared(codes, tables), offsets, tables), tables).cut(height, width)
 
 

@@ -2,6 +2,8 @@
 
     codes -> merged frame -> channels, phi, deviation, table phi -> light;  loss = mean over windows of log(MSE)
 
+Some windows lack frames on one side or both, as those at the ends of a stream do.
+
 The error is that of a score: light over the peak, clamped. Its logarithm gives a dim window the same weight as a bright
 one; otherwise the dimmest would own the gradient. Above the peak the clamp keeps a small slope.
 """
@@ -22,6 +24,8 @@ from quiver.restoration.merge_inputs import InformationDomain, batch_inputs, mid
 from quiver.training.settings import Protocol, Settings
 from quiver.training.system import Batch
 
+ENDS = 0.3  # share of the windows that lack frames
+SIDE = WINDOW // 2  # frames before and after the one that is restored
 KEPT = 256  # sensors whose tables stay on a device
 NODES = 1024  # of the table from phi to light, evenly spaced in phi
 FLOOR = 2e-6  # added to a mean squared error: 57 dB
@@ -48,9 +52,17 @@ def check(network: nn.Module, settings: Settings) -> None:
         raise ValueError(f"frames={settings.frames}: mergenet restores from {WINDOW} frames; leave frames= out")
 
 
-def prepare(codes: Codes) -> dict[str, Tensor]:
+def kept_frames(sample: int) -> tuple[int, int]:
+    """Return how many frames before and after the middle one the window of a number keeps."""
+    rng = np.random.default_rng([sample, 20261129])
+    if rng.random() >= ENDS:
+        return SIDE, SIDE
+    return int(rng.integers(SIDE + 1)), int(rng.integers(SIDE + 1))
+
+
+def prepare(codes: Codes, sample: int) -> dict[str, Tensor]:
     """Return the inputs of the middle frame of a window, and the table from phi to light over white."""
-    inputs, domain = middle_inputs(codes)
+    inputs, domain = middle_inputs(codes, kept_frames(sample))
     top, table = light_table(domain, codes.white, torch.device("cpu"))
     return {
         "channels": inputs.channels[0],
@@ -64,7 +76,8 @@ def prepare(codes: Codes) -> dict[str, Tensor]:
 @torch.no_grad()
 def prepare_batch(codes: Tensor, sensors: Sequence[SeenBy]) -> dict[str, Tensor]:
     """Return what `prepare` does for windows of codes [B, T, h, w] at once, on their device."""
-    inputs, domains = batch_inputs(codes, [(seen.sensor, seen.exposure) for seen in sensors])
+    kept = [kept_frames(seen.sample) for seen in sensors]
+    inputs, domains = batch_inputs(codes, [(seen.sensor, seen.exposure) for seen in sensors], kept)
     ends = [_light_table(domain, seen.white, codes.device) for domain, seen in zip(domains, sensors, strict=True)]
     return {
         "channels": inputs.channels,

@@ -57,12 +57,12 @@ def _check(core: System, network: Any, settings: Settings) -> None:
     core.check(network.core, settings)
 
 
-def prepare(of_place: Prepare | None, codes: Codes) -> dict[str, Tensor]:
+def prepare(of_place: Prepare | None, codes: Codes, sample: int) -> dict[str, Tensor]:
     """Return the linear estimate's filters, and the inputs that the core needs of every place, stacked."""
     found = {KERNELS: torch.from_numpy(codes.demosaicing_filters.astype(np.float32))}
     if of_place is None:
         return found
-    each = [of_place(place) for _, place in places(codes)]
+    each = [of_place(place, sample) for _, place in places(codes)]
     return found | {f"{OF_PLACE}{name}": torch.stack([inputs[name] for inputs in each]) for name in each[0]}
 
 

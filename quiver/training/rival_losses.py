@@ -52,7 +52,7 @@ def windows_restored(network: Any, batch: Batch) -> tuple[Tensor, int]:
 # Networks that take the noise of the sensor
 
 
-def noise_inputs(codes: Codes) -> dict[str, Tensor]:
+def noise_inputs(codes: Codes, sample: int) -> dict[str, Tensor]:
     """Return the noise table of a window's sensor [n], as `variance`."""
     return {"variance": torch.tensor(noise_table(codes.sensor, codes.exposure))}
 

@@ -355,7 +355,7 @@ def test_windows_that_no_device_draws_say_why(make_clip: ClipMaker, tmp_path: Pa
     clips = [make_clip("a"), make_clip("b", seed=1, sharp=True)]
     plain = WindowSettings(crop=16)
     unfit("copies at rest", Windows(clips, replace(plain, still=True)))
-    unfit("computed where windows are drawn", Windows(clips, plain, prepare=lambda codes: {}))
+    unfit("computed where windows are drawn", Windows(clips, plain, prepare=lambda codes, n: {}))
     for table in (Defects(crosstalk=0.1), Defects(FixedPattern(offset=0.1))):
         light = replace(LIGHTS[3 if table.crosstalk else 0].stated(), defects=json.dumps(table.to_dict()))
         unfit("has crosstalk, afterpulses, or pixels with", Windows(clips, replace(plain, lights=(light,))))

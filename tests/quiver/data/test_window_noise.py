@@ -136,7 +136,7 @@ def test_filled_windows_are_prepared_with_the_dark_rate_of_good_pixels(make_clip
     clip = make_clip(radiance=np.full((14, 20, 26), 0.5), relative=True)
     light = Illumination.of(file, 10.0, 3)
     seen = []
-    data = Windows([clip], WindowSettings(crop=16, lights=(light,)), prepare=lambda codes: seen.append(codes) or {})
+    data = Windows([clip], WindowSettings(crop=16, lights=(light,)), prepare=lambda codes, n: seen.append(codes) or {})
     data[0]
     assert seen[0].sensor == sensed(clip, light)[0].sensor
     assert seen[0].sensor.dark_rate < 0.01 * data.noise.noises[0].draw(clip).sensor.dark_rate

@@ -33,7 +33,7 @@ def sample(sensor, seed=0, ppp=2.0):
     rng = np.random.default_rng(seed)
     codes = rng.integers(0, sensor.levels, (5, 16, 24)).astype(np.uint8)
     target = torch.from_numpy(rng.random((5, 1, 16, 24), np.float32))
-    found = mt.prepare(array_codes(codes, sensor, EXPOSURE))
+    found = mt.prepare(array_codes(codes, sensor, EXPOSURE), seed)
     white = sensor.white(EXPOSURE)
     return {"codes": torch.zeros(5, 1, 16, 24), "target": target, "white": white, "peak": 2.5 * ppp} | found
 
@@ -83,18 +83,35 @@ def test_training_lowers_the_loss():
 
 
 def test_inputs_of_a_batch_are_those_of_its_windows():
-    """Over sensors and bits. In the batch codes are over the top code, as samples have them."""
+    """Over sensors, bits and missing frames. In the batch codes are over the top code, as samples have them."""
     rng = np.random.default_rng(2)
-    sensors = [random_sensor(rng) for _ in range(6)]
+    sensors = [random_sensor(rng) for _ in range(20)]
+    assert len({mt.kept_frames(n) for n in range(20)}) > 4
     codes = [window_of(rng, sensor, (11, 40, 48)) for sensor in sensors]
     windows = [array_codes(one, sensor, EXPOSURE) for one, sensor in zip(codes, sensors, strict=True)]
-    alone = collated([mt.prepare(window) for window in windows])
+    alone = collated([mt.prepare(window, n) for n, window in enumerate(windows)])
     samples = [{"codes": as_input(one, sensor)} for one, sensor in zip(codes, sensors, strict=True)]
-    batch = collated([one | seen_by(window) for one, window in zip(samples, windows, strict=True)])
+    known = [seen_by(window, n) for n, window in enumerate(windows)]
+    batch = collated([one | seen for one, seen in zip(samples, known, strict=True)])
     together = replace(SYSTEMS[MergeNet], prepare=seen_by).with_inputs(batch)
     assert set(together) == {"codes", *alone}
     for name, values in alone.items():
         torch.testing.assert_close(together[name], values, rtol=1e-5, atol=1e-4 if name == "channels" else 1e-5)
+
+
+def test_some_windows_lack_frames():
+    """Numbers decide, so that a resumed training draws the same; the rest of the windows is whole."""
+    kept = [mt.kept_frames(n) for n in range(4000)]
+    whole = kept.count((5, 5)) / len(kept)
+    assert whole == pytest.approx(1 - mt.ENDS * 35 / 36, abs=0.03)
+    assert len(set(kept)) == 36
+    sensor = QIS(0.8, 1.6, 0.2, 3)
+    codes = np.random.default_rng(0).integers(0, 8, (11, 16, 24)).astype(np.uint8)
+    short = next(n for n in range(100) if mt.kept_frames(n) == (0, 4))
+    found = mt.prepare(array_codes(codes, sensor, EXPOSURE), short)
+    same = codes.copy()
+    same[:5] = 0  # what lies before the middle frame is not seen
+    assert torch.equal(found["channels"], mt.prepare(array_codes(same, sensor, EXPOSURE), short)["channels"])
 
 
 def test_inputs_are_made_on_a_gpu_alone(monkeypatch):
@@ -116,7 +133,7 @@ def test_the_inputs_of_a_batch_wait_for_nothing(device):
     system = replace(SYSTEMS[MergeNet], prepare=seen_by)
     batch = {
         "codes": torch.zeros(2, 11, 1, 40, 48, device=device),
-        SENSORS: [SeenBy(sensor, EXPOSURE, sensor.white(EXPOSURE)) for sensor in sensors],
+        SENSORS: [SeenBy(sensor, EXPOSURE, sensor.white(EXPOSURE), n) for n, sensor in enumerate(sensors)],
         TOP: torch.ones(2, device=device),
     }
     system.with_inputs(batch)

@@ -109,7 +109,7 @@ def test_training_and_restoring_agree(mosaics, tmp_path):
     sample = {
         "codes": torch.from_numpy(codes.read(0, 11) / np.float32(7))[None, :, None],
         "white": torch.tensor([codes.white]),
-        **{name: value[None] for name, value in system.prepare(codes).items()},
+        **{name: value[None] for name, value in system.prepare(codes, 0).items()},
     }
     with torch.no_grad():
         bands, first = system.restored(network, sample)

@@ -450,7 +450,7 @@ def test_flornn_needs_its_look_ahead_and_a_flow(tiny_dataset, tmp_path):
 # ---- Inputs that are computed where samples are drawn
 
 
-def moments(codes: Codes) -> dict[str, Tensor]:
+def moments(codes: Codes, sample: int) -> dict[str, Tensor]:
     """The mean code of a window, and what is known of its sensor and light."""
     mean = codes.read(0, codes.shape[0]).mean(axis=0, dtype=np.float32)
     known = [codes.sensor.bits, codes.white, codes.ppp or 0.0, codes.exposure]
