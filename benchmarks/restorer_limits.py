@@ -1,6 +1,6 @@
 """Measures the restorer that ships where its grid does not reach: flat fields, few frames, faults, light that changes.
 
-    python benchmarks/restorer_limits.py                           # ten minutes; docs/results/restorer_limits.md, .json
+    python benchmarks/restorer_limits.py                           # a quarter of an hour; docs/results/restorer_limits.md, .json
     python benchmarks/restorer_limits.py --draws 2 --size 48 --out out/limits
 
 Every number is a mean over draws with its standard error. Draws differ in the sensor's noise and, where something
@@ -43,6 +43,7 @@ LEVELS = (0.5, 3.25, 26.0, 100.0)  # PPP that the gain is set for
 SHARES = (0.1, 1.0, 2.0)  # light of a flat field over that level
 PLANES = (1.0, 5.0)  # PPP on one binary SPAD plane
 DARK = (1.0, 3.25)  # PPP beside the dark counts of the published sensor
+TEXTURES = (0.5, 3.0, 30.0)  # PPP of photographs whose mean light is compared, 3 bits
 SHORT = (1, 2, 3, 4, 6, 11)  # frames of a stream
 SEEN = (("quiver-physical", 3.25, 3), ("quiver-physical", 0.5, 3), ("spad-320x240", 1.0, 1))  # by short streams
 MOTION = (0.0, 2.0, 6.0)  # px/frame
@@ -165,6 +166,34 @@ def dark(draws: int, size: int) -> dict[str, list[float]]:
     }
 
 
+def textures(draws: int, size: int) -> dict[str, list[float]]:
+    """Return the mean of the restored middle frame over that of its truth, of photographs, by light and motion."""
+    found: dict[str, list[float]] = {}
+    inner = (slice(EDGE, -EDGE), slice(EDGE, -EDGE))
+    for ppp in TEXTURES:
+        for motion in MOTION:
+            row = found[f"{ppp:g} PPP, {motion:g} px/frame"] = []
+            for n in range(draws):
+                codes, target = moving(motion, ppp, size, n)
+                restored = restorer(NAME).restore(codes, MIDDLE, MIDDLE + 1)[0]
+                row.append(float(restored[inner].mean() / target[inner].mean()))
+    return found
+
+
+def ends(draws: int, size: int) -> dict[str, dict[str, list[float]]]:
+    """Return the dB that the frames before cost if they lack, by light and motion, of the restorer and the rival."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for ppp in LIGHTS:
+        for motion in MOTION:
+            row = found[f"{ppp:g} PPP, {motion:g} px/frame"] = {NAME: [], RIVAL: []}
+            for n in range(draws):
+                codes, target = moving(motion, ppp, size, n)
+                begun = exchanged(codes, codes.read(MIDDLE, FRAMES))
+                for name, lost in row.items():
+                    lost.append(psnr(name, codes, target) - psnr(name, begun, target, 0))
+    return found
+
+
 def short(draws: int, size: int) -> dict[str, dict[str, Any]]:
     """Return, by frames of the stream, brightness of flat fields and the gain over the rival [dB] on what moves."""
     lights = [Illumination.of(*seen) for seen in SEEN]
@@ -271,6 +300,11 @@ def page(found: dict[str, Any]) -> str:
     text += markdown_table([(k, told(v, 3)) for k, v in found["planes"].items()], ("field", "brightness"))
     text += ["", "## Dark counts", "", "A flat field seen by `quiver-published` at 3 bits.", ""]
     text += markdown_table([(k, told(v, 3)) for k, v in found["dark"].items()], ("method, light", "brightness"))
+    text += ["", "## Textures", "", "Photographs that slide, 3 bits: brightness.", ""]
+    text += markdown_table([(k, told(v, 3)) for k, v in found["textures"].items()], ("light, motion", "brightness"))
+    text += ["", "## The first frame", "", "dB that it costs a frame to be the first of its stream, 3 bits.", ""]
+    rows = [(k, *(told(v[name], 2) for name in (NAME, RIVAL))) for k, v in found["ends"].items()]
+    text += markdown_table(rows, ("light, motion", NAME, RIVAL))
     text += ["", "## Few frames", "", f"The gain is over {RIVAL}, at 3.25 PPP, 3 bits, 2 px/frame.", ""]
     rows = [(k, *(told(x, 3) for x in v["brightness"]), told(v["gain"], 2)) for k, v in found["short"].items()]
     header = ("frames", *(f"brightness, {sensor}, {bits} bit, {ppp:g} PPP" for sensor, ppp, bits in SEEN), "gain [dB]")
@@ -327,8 +361,8 @@ def main(words: list[str] | None = None) -> int:
     if args.draws < 2 or not 4 * EDGE <= args.size <= 256:
         print(f"restorer_limits: give --draws of at least 2 and --size of {4 * EDGE} to 256", file=sys.stderr)
         return 2
-    parts = (fields, planes, dark, short, defects, faults, changing, details)
-    found = {"format": "quiver-restorer-limits-2", "quiver": VERSION, "weights": digest(weights_path(NAME))}
+    parts = (fields, planes, dark, textures, ends, short, defects, faults, changing, details)
+    found = {"format": "quiver-restorer-limits-3", "quiver": VERSION, "weights": digest(weights_path(NAME))}
     found |= {"draws": args.draws, "size": args.size}
     found |= {part.__name__: part(args.draws, args.size) for part in parts}
     args.out.parent.mkdir(parents=True, exist_ok=True)

@@ -72,6 +72,7 @@ def test_the_program_writes_page_and_numbers(tmp_path, monkeypatch):
     monkeypatch.setattr(restorer_limits, "DARK", (1.0,))
     monkeypatch.setattr(restorer_limits, "SHORT", (1, 2))
     monkeypatch.setattr(restorer_limits, "MOTION", (2.0,))
+    monkeypatch.setattr(restorer_limits, "TEXTURES", (3.0,))
     monkeypatch.setattr(restorer_limits, "LIGHTS", (26.0,))
     monkeypatch.setattr(restorer_limits, "RIVAL", "moment")
     monkeypatch.setattr(restorer_limits, "SEEN", (("spad-320x240", 1.0, 1),))
@@ -88,8 +89,10 @@ def test_the_program_writes_page_and_numbers(tmp_path, monkeypatch):
     row = found["defects"]["26 PPP, 2 px/frame"]
     assert np.mean(row["no map"]) > np.mean(row["map"]) > 0
     assert min(found["faults"]["white, 26 PPP"]) > 0
+    assert np.mean(found["textures"]["3 PPP, 2 px/frame"]) == pytest.approx(1, abs=0.1)
+    assert np.mean(found["ends"]["26 PPP, 2 px/frame"]["moment"]) < 0  # less of what moves is averaged
     text = (tmp_path / "limits.md").read_text()
-    for name in ("3 bit, gain of 3.25 PPP", "moment, 1 PPP", "26 PPP, 2 px/frame", "black, 26 PPP", "| 2 |"):
+    for name in ("3 bit, gain of 3.25 PPP", "moment, 1 PPP", "3 PPP, 2 px/frame", "26 PPP, 2 px/frame", "black, 26 PPP", "| 2 |"):
         assert name in text
     for name in ("0 px/frame, 80 %", "checkerboard of 2 px, still, 26 PPP", "points of 8 on 3 photons, 0 px/frame"):
         assert name in text
