@@ -1,6 +1,6 @@
 """Measures the restorer that ships where its grid does not reach: flat fields, few frames, faults, light that changes.
 
-    python benchmarks/restorer_limits.py                           # a quarter of an hour; docs/results/restorer_limits.md, .json
+    python benchmarks/restorer_limits.py                  # a quarter of an hour; docs/results/restorer_limits.md, .json
     python benchmarks/restorer_limits.py --draws 2 --size 48 --out out/limits
 
 Every number is a mean over draws with its standard error. Draws differ in the sensor's noise and, where something

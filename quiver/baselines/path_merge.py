@@ -52,6 +52,8 @@ Follow = Callable[[Sequence[int]], tuple[Tensor, Tensor, Tensor]]
 STATISTICS = ((1, 1, 3.0, 1.0), (0, 2, 1.6, 0.25))
 GROUPS = ((-1,), (1,), (-2, -3), (2, 3), (-4, -5), (4, 5))  # offsets of the frames that `Merged.groups` averages
 PIXEL_BYTES = 3_000  # that a pixel of a window takes on a GPU, where all frames and velocities are tried at a time
+LINEAR = 0.5  # of the largest mean code, up to which codes follow light and are scaled with it
+FLAT = 0.8  # of it, from which they are left as they are: near saturation they hardly follow light
 MOST_SHARE = 2.0  # of a frame in brighter light than the reference; saturated codes would seem to tell everything
 LEAST_NOISE = 0.1  # of a group of frames; a cubic leaves a frame half of its noise
 NEAR = 2  # groups of one frame beside the reference; the other frames are compared with the mean of these three
@@ -144,7 +146,10 @@ def evened(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Pr
     variance = tables.variance(of_codes[:, None] * level) / of_codes[:, None].square()
     shares = (tables.variance(level) / variance)[:, 0].clamp(max=MOST_SHARE)
     pyramid = {scale: phi / of_phi[..., None, None] for scale, phi in window.pyramid.items()}
-    return Prepared(window.codes / of_codes[..., None, None], pyramid, window.size, shares)
+    highest = torch.maximum(coarse, coarse[:, centre, None]) / tables.last[:, None]
+    followed = (FLAT - highest).div_(FLAT - LINEAR).clamp_(0, 1)
+    factors = enlarged((of_codes - 1)[..., None, None] * followed, window.codes.shape[-2:]).add_(1)
+    return Prepared(window.codes / factors, pyramid, window.size, shares)
 
 
 def merge_along(window: Prepared, offsets: Sequence[int], tables: DomainTables, found: Moves) -> Merged:

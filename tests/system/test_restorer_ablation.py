@@ -11,6 +11,8 @@ import pytest
 import torch
 from clips import write_dataset
 
+from quiver.model.mergenet import INPUTS
+
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
@@ -45,7 +47,11 @@ def test_every_variant_changes_what_is_learned():
     """All but those of other windows differ in the first step already."""
     rng = np.random.default_rng(0)
     shape = (2, 32, 32)
-    batch = {"channels": rng.normal(size=(2, 13, 32, 32)), "phi": 4 + rng.normal(size=shape), "top": np.full(2, 9.0)}
+    batch = {
+        "channels": rng.normal(size=(2, INPUTS, 32, 32)),
+        "phi": 4 + rng.normal(size=shape),
+        "top": np.full(2, 9.0),
+    }
     batch |= {"deviation": np.full(shape, 0.3), "target": rng.uniform(0, 1, shape), "unit": np.ones(2)}
     batch["table"] = np.tile(np.linspace(0, 1, 16), (2, 1))
     tensors = {name: torch.from_numpy(value).float() for name, value in batch.items()}

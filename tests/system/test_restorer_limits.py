@@ -92,7 +92,14 @@ def test_the_program_writes_page_and_numbers(tmp_path, monkeypatch):
     assert np.mean(found["textures"]["3 PPP, 2 px/frame"]) == pytest.approx(1, abs=0.1)
     assert np.mean(found["ends"]["26 PPP, 2 px/frame"]["moment"]) < 0  # less of what moves is averaged
     text = (tmp_path / "limits.md").read_text()
-    for name in ("3 bit, gain of 3.25 PPP", "moment, 1 PPP", "3 PPP, 2 px/frame", "26 PPP, 2 px/frame", "black, 26 PPP", "| 2 |"):
+    for name in (
+        "3 bit, gain of 3.25 PPP",
+        "moment, 1 PPP",
+        "3 PPP, 2 px/frame",
+        "26 PPP, 2 px/frame",
+        "black, 26 PPP",
+        "| 2 |",
+    ):
         assert name in text
     for name in ("0 px/frame, 80 %", "checkerboard of 2 px, still, 26 PPP", "points of 8 on 3 photons, 0 px/frame"):
         assert name in text
