@@ -304,7 +304,7 @@ def _too_short(name: str, frames: int, bits: int) -> str | None:
         off = 30
     else:
         off = 12 if bits == 1 else 5
-    return f"{name} was never trained on {stream} of {bits} bit, and its brightness may be wrong by up to {off} %"
+    return f"{name} has little to go by in {stream} of {bits} bit: its brightness may be wrong by up to {off} %"
 
 
 def _dark_share(codes: Codes, ppp: float) -> float:

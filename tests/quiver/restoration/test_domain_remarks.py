@@ -255,11 +255,11 @@ def test_dark_counts_and_few_frames_are_told():
     assert far.endswith("dark counts are 200 % of the mean light, and dark places may become too bright")
     assert "dark" not in str(domain.remark("mine", scope, stream(ppp=100.0)))
     for frames, words in (
-        (1, "one frame of 3 bit, and its brightness may be wrong by up to 30 %"),
+        (1, "one frame of 3 bit: its brightness may be wrong by up to 30 %"),
         (3, "3 frames of 3"),
     ):
         few = replace(plain, shape=(frames, *plain.shape[1:]))
-        assert f"never trained on {words}" in str(domain.remark("mine", scope, few))
+        assert f"little to go by in {words}" in str(domain.remark("mine", scope, few))
     assert domain.remark("mine", scope, replace(plain, shape=(4, *plain.shape[1:]))) is None
     binary = Scope(Domain((cell(1.0, 25.0, bits=1, sensor="spad-320x240"),), {}))
     for frames, words in ((1, "30 %"), (4, "12 %"), (10, "12 %"), (11, None)):
