@@ -24,6 +24,7 @@ NotNegative = Annotated[float, Meta(ge=0.0, le=LARGEST)]
 Positive = Annotated[float, Meta(ge=SMALLEST, le=LARGEST)]
 Light = Annotated[float, Meta(ge=1e-6, le=1e6)]  # photons per pixel, or lux
 Share = Annotated[float, Meta(ge=1e-6, le=1.0)]  # of a full exposure
+Part = Annotated[float, Meta(ge=0.0, le=1.0)]  # of a whole
 Shutter = Annotated[float, Meta(ge=0.0, le=1.0)]  # open share of a frame
 FrameRate = Annotated[float, Meta(ge=1.0, le=1e8)]  # 1/s
 Rise = Annotated[float, Meta(ge=-0.9, le=10.0)]  # of light, over what it was at first

@@ -40,7 +40,8 @@ class Output:
     scale1: Tensor  # [B, T-10, 1, H, W], restored frames 5 .. T-6
     scale2: Tensor | None  # [B, T-10, 1, H/2, W/2]
     scale4: Tensor | None  # [B, T-10, 1, H/4, W/4]
-    flow: Tensor | None = None  # [B, T-1, 2, H, W], pixels, on the grid of frame t+1 and pointing into frame t
+    # [B, T-1, 2, H/s, W/s] for s = 1, 2, 4, pixels of that scale, on the grid of frame t+1 and pointing into frame t
+    flows: tuple[Tensor, ...] | None = None
 
 
 def check_input(x: Tensor, multiple: int) -> None:

@@ -86,8 +86,15 @@ class QUIVER(nn.Module):
             scale1,
             scale2 if self.config.multi_scale else None,
             scale4 if self.config.multi_scale else None,
-            flows[0] if self.config.flow else None,
+            tuple(flows) if self.config.flow else None,
         )
+
+    def parts(self, x: Tensor) -> tuple[Tensor | None, list[Tensor] | None]:
+        """[B, T, 1, H, W] as of `forward` -> denoised frames and flows as in `Output`, without the later stages."""
+        check_input(x, self.multiple)
+        denoised = _per_frame(self.denoise, x)[0]
+        flows = _per_frame(self.flows, denoised[:, 1:], denoised[:, :-1]) if self.config.flow else None
+        return denoised if self.config.pre_denoiser else None, flows
 
     # Stages
 

@@ -364,7 +364,7 @@ class Trainer:
             try:
                 network = Compiled(self.model, self.run.settings.compile)
                 self.objective.use_compiled(network)
-                self._gradients(self.objective, batch)
+                self._gradients(self.objective, batch, share=1.0)  # of the whole network: a part may learn before it
                 problem = "" if network.called else why_not(None)
             except Exception as error:  # of many kinds; what compiling does not cause, the step itself raises again
                 problem = why_not(error)
@@ -378,10 +378,13 @@ class Trainer:
         # have no gradient; processes wait for all gradients unless told to look.
         return nn.parallel.DistributedDataParallel(self.objective, find_unused_parameters=True)
 
-    def _gradients(self, objective: nn.Module, batch: Batch) -> Tensor:
-        """Add up the gradients of the parts of a batch, and return its loss, a scalar on the device."""
+    def _gradients(self, objective: nn.Module, batch: Batch, share: float | None = None) -> Tensor:
+        """Add up the gradients of the parts of a batch, and return its loss, a scalar on the device.
+
+        `share` of the run is over; None: as the state has it.
+        """
         settings = self.run.settings
-        share = share_used(settings, self.state)
+        share = share_used(settings, self.state) if share is None else share
         count = settings.accumulate
         self.model.zero_grad(set_to_none=True)
         total: Tensor | None = None
@@ -458,7 +461,7 @@ class Trainer:
         entry = {"step": state.step, "elapsed": state.elapsed, "loss": self.loss, "learning_rate": self.rate}
         state.history.append(entry | score.to_dict())
         finite = math.isfinite(score.psnr_matched)
-        if finite and share_used(self.run.settings, state) >= self.system.begins(self.model):
+        if finite and share_used(self.run.settings, state) >= self.system.begins(self.model, self.run.settings):
             note_plateau(self.run.settings.patience, state, score.psnr_matched)
         if state.best == -math.inf or (finite and score.psnr_matched > state.best):  # without one the newest weights
             state.best = score.psnr_matched if finite else state.best

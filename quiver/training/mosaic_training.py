@@ -24,7 +24,7 @@ from quiver.data.windows import Prepare
 from quiver.model.mosaic_network import MosaicNet
 from quiver.restoration.mosaics import places
 from quiver.training.loss import PRESETS as LOSSES
-from quiver.training.loss import training_loss
+from quiver.training.loss import training_loss, without_flow
 from quiver.training.merge_training import log_error
 from quiver.training.settings import Settings
 from quiver.training.system import Batch, System
@@ -49,6 +49,8 @@ def mosaic_system(core: System, network: MosaicNet) -> System:
         multiple=core.side(network.core) * math.lcm(*network.config.tile),
         prepare=partial(prepare, core.prepare),
         prepare_batch=None,
+        losses=without_flow(core.losses),
+        pretrains=False,
         check=partial(_check, core),
     )
 

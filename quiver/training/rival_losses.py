@@ -170,7 +170,7 @@ def check_memdeblur(network: Any, settings: Settings) -> None:
 TEACHING = 0.3  # share of a run for each teacher
 
 
-def student_begins(network: Any) -> float:
+def student_begins(network: Any, settings: Settings) -> float:
     """Return the share of a run after which the student learns: at once without teachers."""
     return 2 * TEACHING if network.config.distil else 0.0
 
@@ -192,7 +192,7 @@ def student_teacher_loss(network: Any, batch: Batch, settings: Settings, share: 
     sharp = batch["target"][:, part, 0]
     centre = sharp[:, RADIUS : RADIUS + 1]
     teachers = (network.motion_teacher, sharp), (network.noise_teacher, batch["still"][:, :WINDOW, 0])
-    if share < student_begins(network):
+    if share < student_begins(network, settings):
         teacher, seen = teachers[share >= TEACHING]
         return functional.mse_loss(teacher(seen).restored.float(), centre)
     taught = network.student(batch["codes"][:, part, 0])

@@ -11,7 +11,7 @@ import numpy as np
 
 from qsim import records
 from qsim.files import Blocked, Damaged, read_json
-from qsim.kinds import Bits, Count, Frames, Light, Number, Positive, Seed, Split, Text, Whole
+from qsim.kinds import Bits, Count, Frames, Light, Number, Part, Positive, Seed, Split, Text, Whole
 from qsim.settings import setting
 from qsim.words import positive_numbers
 from quiver import threads
@@ -122,6 +122,10 @@ class Settings:
             "of quiver and unet; compared networks have their own", unset="the protocol's", choices=(*LOSSES, "own")
         ),
     ] = "published"  # see loss.py
+    pretraining: Annotated[
+        Part,
+        setting("share of the run for QUIVER's pre-denoiser and flow alone", unset="the protocol's"),
+    ] = 0.0  # from clean frames, see loss.parts_loss
     flips: bool = True  # the eight flips and quarter turns
     reverse: bool = True  # time reversal
     drift: int = 0  # px/frame, largest speed at which half of the crops move through their clip
@@ -217,6 +221,7 @@ class Protocol(TypedDict, total=False):
     warmup: int
     clip_norm: float
     loss: str
+    pretraining: float
     reverse: bool
     drift: int
     force_exposure: bool

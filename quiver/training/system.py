@@ -40,7 +40,7 @@ def nothing_to_refuse(network: nn.Module, settings: Settings) -> None:
     """Accept all settings."""
 
 
-def at_once(network: nn.Module) -> float:
+def at_once(network: nn.Module, settings: Settings) -> float:
     """Return 0: the network learns from the first step on."""
     return 0.0
 
@@ -61,7 +61,9 @@ class System:
     prepare_batch: PrepareBatch | None = None  # computes the same inputs of a batch on a device
     still: bool = False  # samples also hold noisy copies of the centre frame
     of_stream: bool = False  # learns from the frames of one stored stream, without truth or validation
-    begins: Callable[[nn.Module], float] = at_once  # share of a run after which the scored part learns
+    # (network, settings) -> share of a run after which the scored part learns
+    begins: Callable[[nn.Module, Settings], float] = at_once
+    pretrains: bool = False  # some parts can learn alone for the first `pretraining` of a run
     check: Callable[[nn.Module, Settings], None] = nothing_to_refuse  # ValueError for settings that do not fit
 
     def on(self, device: torch.device, windows: str = "auto") -> System:
@@ -105,6 +107,10 @@ class System:
         if settings.loss not in self.losses:
             raise ValueError(
                 f"loss={settings.loss}: {self.name} is trained with {' or '.join(self.losses)}; leave loss= out"
+            )
+        if settings.pretraining and not self.pretrains:
+            raise ValueError(
+                f"pretraining={settings.pretraining:g}: {self.name} has no parts that learn alone; leave it out"
             )
         if self.of_stream and settings.schedule == "plateau":
             raise ValueError(f"schedule=plateau: follows validations, and {self.name} has none; leave it out")

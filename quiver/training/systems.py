@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Unpack
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +23,7 @@ from quiver.model.unet import UNet
 from quiver.training import merge_training as merging
 from quiver.training import rival_losses as rivals
 from quiver.training.loss import PRESETS as LOSSES
-from quiver.training.loss import training_loss
+from quiver.training.loss import parts_loss, training_loss, without_flow
 from quiver.training.mosaic_training import mosaic_system
 from quiver.training.self_supervised import split_loss
 from quiver.training.settings import PROTOCOLS, Protocol, Settings
@@ -74,9 +73,25 @@ def _protocols(published: Protocol, **quick: Unpack[Protocol]) -> dict[str, Prot
 # ---- Networks with the outside of QUIVER, and the control
 
 
-def quiver_loss(network: nn.Module, batch: Batch, settings: Settings, share: float) -> Tensor:
-    """Return the loss of loss.py that the settings name."""
+def quiver_loss(network: Any, batch: Batch, settings: Settings, share: float) -> Tensor:
+    """Return the loss of loss.py that the settings name, first of the pre-denoiser and the flow alone if they ask."""
+    if share < settings.pretraining:
+        denoised, flows = network.parts(batch["codes"])
+        return parts_loss(denoised, flows, batch["target"], LOSSES[settings.loss])
     return training_loss(network(batch["codes"]), batch["target"], LOSSES[settings.loss], first=RADIUS)
+
+
+def quiver_begins(network: Any, settings: Settings) -> float:
+    """Return the share of a run after which the complete network learns."""
+    return settings.pretraining
+
+
+def check_quiver(network: Any, settings: Settings) -> None:
+    """Raise `ValueError` for settings of parts that a network lacks."""
+    if settings.pretraining and not (network.config.pre_denoiser or network.config.flow):
+        raise ValueError("pretraining: this network has neither pre-denoiser nor flow; leave it out")
+    if LOSSES[settings.loss].alignment and not network.config.flow:
+        raise ValueError(f"loss={settings.loss}: is one of the flow, which this network lacks; choose another")
 
 
 def quiver_restored(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:
@@ -91,7 +106,16 @@ def unet_loss(network: nn.Module, batch: Batch, settings: Settings, share: float
     return training_loss(output, batch["target"], LOSSES[settings.loss], first=first)
 
 
-OURS = System("quiver", quiver_loss, quiver_restored, PROTOCOLS, losses=tuple(LOSSES))
+OURS = System(
+    "quiver",
+    quiver_loss,
+    quiver_restored,
+    PROTOCOLS,
+    losses=tuple(LOSSES),
+    begins=quiver_begins,
+    pretrains=True,
+    check=check_quiver,
+)
 
 SYSTEMS: dict[type[nn.Module], System] = {
     MergeNet: System(
@@ -104,7 +128,7 @@ SYSTEMS: dict[type[nn.Module], System] = {
         prepare_batch=merging.prepare_batch,
         check=merging.check,
     ),
-    UNet: replace(OURS, name="unet", loss=unet_loss, restored=rivals.windows_restored),
+    UNet: System("unet", unet_loss, rivals.windows_restored, PROTOCOLS, losses=without_flow(LOSSES)),
     EMVD: System(
         name="emvd",
         loss=rivals.emvd_loss,

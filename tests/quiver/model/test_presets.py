@@ -40,7 +40,7 @@ def test_ablations_lack_what_they_say(row):
     network = lively(config)
     assert (network.denoiser is None, network.flow is None) == (not pre_denoiser, not flow)
     out = network(draw(1, 11, 1, 16, 16))
-    assert (out.denoised is None, out.flow is None) == (not pre_denoiser, not flow)
+    assert (out.denoised is None, out.flows is None) == (not pre_denoiser, not flow)
     assert (out.scale2 is None, out.scale4 is None) == (not multi_scale, not multi_scale)
     assert torch.isfinite(out.scale1).all()
     x = draw(1, 13, 1, 16, 16)

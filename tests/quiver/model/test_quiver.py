@@ -78,7 +78,7 @@ def test_output_shapes_and_units():
     assert out.scale1.shape == (2, 3, 1, 16, 24)
     assert out.scale2.shape == (2, 3, 1, 8, 12)
     assert out.scale4.shape == (2, 3, 1, 4, 6)
-    assert out.flow.shape == (2, 12, 2, 16, 24)
+    assert [flow.shape for flow in out.flows] == [(2, 12, 2, 16 // s, 24 // s) for s in (1, 2, 4)]
 
 
 def test_alignment_starts_from_the_flow_alone():
@@ -132,7 +132,7 @@ def test_outputs_and_gradients_are_finite(kind):
     torch.manual_seed(0)
     network = QUIVER(PRESETS["quiver-s"])
     out = network(hard_inputs()[kind])
-    for part in (out.denoised, out.scale1, out.scale2, out.scale4, out.flow):
+    for part in (out.denoised, out.scale1, out.scale2, out.scale4, *out.flows):
         assert torch.isfinite(part).all()
     loss = out.scale1.abs().mean() + out.scale2.abs().mean() + out.scale4.abs().mean() + out.denoised.abs().mean()
     loss.backward()
@@ -159,7 +159,7 @@ def test_flow_beyond_the_frame_is_survived(far):
             level[-1].bias.fill_(far)
     out = network(draw(1, 11, 1, 16, 16, dtype=torch.float32))
     out.scale1.sum().backward()
-    assert float(out.flow.detach().abs().min()) > 100
+    assert float(out.flows[0].detach().abs().min()) > 100
     assert torch.isfinite(out.scale1).all()
     assert all(torch.isfinite(p.grad).all() for p in network.parameters() if p.grad is not None)
 
@@ -180,8 +180,9 @@ def test_half_precision_has_the_stated_error(dtype, promised):
         full = network16(x)
         with torch.autocast("cpu", dtype):
             half = network16(x)
-    for key in ("denoised", "flow", "scale4", "scale2", "scale1"):
-        a = getattr(full, key)
-        b = getattr(half, key).float()
+    pairs = {key: (getattr(full, key), getattr(half, key)) for key in ("denoised", "scale4", "scale2", "scale1")}
+    pairs["flow"] = full.flows[0], half.flows[0]
+    for key, (a, low) in pairs.items():
+        b = low.float()
         error = float((a - b).square().mean().sqrt() / a.std())
         assert 0 < error < promised, (key, error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,23 @@ import torch
 from scipy.signal import convolve2d
 from torch import Tensor
 
-from quiver.training.loss import L1, PAPER, PUBLISHED, Loss, centred, pair_loss, shrink, training_loss
+from quiver.training.loss import (
+    ALIGNED,
+    L1,
+    LEAST_ERROR,
+    LOG_MSE,
+    PAPER,
+    PUBLISHED,
+    SCALES_L1,
+    Loss,
+    alignment_loss,
+    centred,
+    pair_loss,
+    parts_loss,
+    shrink,
+    training_loss,
+    without_flow,
+)
 
 
 @dataclass
@@ -19,6 +36,7 @@ class Output:
     scale1: Tensor
     scale2: Tensor | None
     scale4: Tensor | None
+    flows: tuple[Tensor, ...] | None = None
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:
@@ -111,3 +129,60 @@ def test_tiny_frames_stay_finite(size: int, loss: Loss):
 def test_a_negative_weight_is_refused():
     with pytest.raises(ValueError, match=r"Loss\.gradient_weight must be a finite number >= 0, got -1"):
         Loss(gradient_weight=-1, gradient="sobel", resize="bilinear")
+
+
+def test_the_logarithm_counts_every_frame_in_decibels():
+    """Ten times the squared error of one of two frames adds half of ln 10, at any level."""
+    target = torch.zeros(1, 2, 1, 8, 8)
+    for level in (0.02, 0.5):
+        both = torch.full_like(target, level)
+        one = both * torch.tensor([1.0, 10**0.5]).view(1, 2, 1, 1, 1)
+        wanted = [math.log(level**2 + LEAST_ERROR), math.log(10 * level**2 + LEAST_ERROR)]
+        assert pair_loss(both, target, LOG_MSE).item() == pytest.approx(wanted[0], rel=1e-5)
+        assert pair_loss(one, target, LOG_MSE).item() == pytest.approx(sum(wanted) / 2, rel=1e-5)
+    perfect = torch.zeros_like(target).requires_grad_()
+    pair_loss(perfect, target, LOG_MSE).backward()
+    assert torch.isfinite(perfect.grad).all()
+
+
+def moving(frames: int = 3, side: int = 32, step: int = 4) -> Tensor:
+    """Return a smooth picture [1, T, 1, h, w] that moves right by `step` px/frame."""
+    x = torch.arange(side, dtype=torch.float32)
+    times = torch.arange(frames, dtype=torch.float32)[:, None]
+    row = 0.5 + 0.4 * torch.sin((x - step * times) * 2 * torch.pi / 16)
+    return row[None, :, None, None, :].expand(1, frames, 1, side, side).contiguous()
+
+
+def flows_of(frames: Tensor, right: float) -> list[Tensor]:
+    """Return flows of scales 1, 2, 4 that point `right` pixels of the full scale to the right."""
+    count, _, _, height, width = frames.shape
+    found = []
+    for s in (1, 2, 4):
+        flow = torch.zeros(count, frames.shape[1] - 1, 2, height // s, width // s)
+        flow[:, :, 0] = right / s
+        found.append(flow)
+    return found
+
+
+def test_the_true_flow_aligns_clean_frames():
+    """The flow points into the frame before: a picture that moves right by 4 px comes from 4 px to the left."""
+    target = moving()
+    true, none, wrong = (alignment_loss(flows_of(target, x), target, SCALES_L1).item() for x in (-4, 0, 4))
+    assert true < 0.2 * none  # what came in at the left is not in the frame before
+    assert none < wrong
+    inside = [flow.requires_grad_() for flow in flows_of(target, -3)]
+    alignment_loss(inside, target, SCALES_L1).backward()
+    assert all(float(flow.grad[:, :, 0].sum()) > 0 for flow in inside)  # less than -3 is better
+
+
+def test_parts_count_alone_and_beside_the_pictures():
+    target = moving(11)
+    flows = flows_of(target, 0.0)
+    aligned = alignment_loss(flows, target, ALIGNED).item()
+    assert parts_loss(target + 0.1, flows, target, ALIGNED).item() == pytest.approx(0.1 + aligned, rel=1e-4)
+    assert parts_loss(None, flows, target, PUBLISHED).item() == pytest.approx(aligned, rel=1e-5)
+    assert parts_loss(target + 0.1, None, target, PUBLISHED).item() == pytest.approx(0.1, rel=1e-4)
+    output = Output(None, target[:, 5:6], None, None, tuple(flows))
+    assert training_loss(output, target, ALIGNED, first=5).item() == pytest.approx(0.2 * aligned, rel=1e-5)
+    assert training_loss(output, target, SCALES_L1, first=5).item() == 0
+    assert without_flow(("aligned", "own", "l1")) == ("own", "l1")

@@ -308,8 +308,39 @@ def test_the_rate_is_kept_until_the_student_learns(tiny_dataset, tmp_path):
     assert rates[:4] == [run.learning_rate] * 4
     begins = system_of(network).begins
     alone = StudentTeacher(StudentTeacherConfig(width=4, blocks=1, distil=False))
-    assert (begins(network), begins(alone)) == (0.6, 0.0)
-    assert system_of(tiny("unet")).begins(tiny("unet")) == 0.0
+    assert (begins(network, None), begins(alone, None)) == (0.6, 0.0)
+    assert system_of(tiny("unet")).begins(tiny("unet"), None) == 0.0
+
+
+def test_parts_of_quiver_learn_alone_first(tiny_dataset, tmp_path):
+    """For a share of the run only the pre-denoiser and the flow change; no validation before counts for a plateau."""
+    network = tiny("quiver")
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    run = tiny_settings(network, tiny_dataset, tmp_path / "r", steps=4, pretraining=0.5, validate_every=1)
+    stopped = iter((False, True))
+    train(network, run, progress=False, should_stop=lambda: next(stopped))
+    changed = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
+    assert changed
+    assert {name.split(".")[0] for name in changed} == {"denoiser", "flow"}
+    train(network, run, progress=False)
+    after = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
+    assert {name.split(".")[0] for name in after} > {"denoiser", "flow", "cell", "attention"}
+    assert system_of(network).begins(network, run) == 0.5
+
+
+def test_what_has_no_such_parts_refuses_their_settings(tiny_dataset, tmp_path):
+    bare = QUIVER(replace(tiny("quiver").config, pre_denoiser=False, flow=False))
+    cases = {
+        "has no parts that learn alone": (tiny("unet"), {"pretraining": 0.5}),
+        "has neither pre-denoiser nor flow": (bare, {"pretraining": 0.5}),
+        "is one of the flow": (bare, {"loss": "aligned"}),
+        "unet is trained with": (tiny("unet"), {"loss": "aligned"}),
+    }
+    for words, (network, asked) in cases.items():
+        run = tiny_settings(network, tiny_dataset, tmp_path / "r", **asked)
+        with pytest.raises(ValueError, match=words):
+            train(network, run, progress=False)
+    assert not (tmp_path / "r").exists()
 
 
 # ---- Settings
