@@ -434,6 +434,7 @@ class Trainer:
         """Determine whether the run ends with this step; validate then, and whenever a validation is due."""
         settings = self.run.settings
         state = self.state
+        tenths = state.tenths
         # One process decides for all: clocks differ, and a process that
         # went on alone would wait forever for the others.
         out_of_time = self.process.any(time_is_up(settings, state, self.validation))
@@ -442,7 +443,7 @@ class Trainer:
             return
         self.settle()  # nothing is stored of a step that was not read
         if self.rendering is not None:
-            self.rendering.complete()
+            self._await_clips(self.rendering, tenths)
         began = time.monotonic()
         if self.fixed is None:  # nothing to validate on: the last weights count as the best
             if self.board is not None and state.finished:
@@ -454,6 +455,16 @@ class Trainer:
         state.halvings = int(self.process.from_leader(state.halvings))
         self.validated = True
         self.validation = time.monotonic() - began
+
+    def _await_clips(self, rendering: Rendering, tenths: int) -> None:
+        """Wait for all clips to validate on; if that is interrupted, store the run as before this validation."""
+        try:
+            rendering.complete()
+        except KeyboardInterrupt:
+            self.state.finished = False
+            self.state.tenths = tenths
+            self.save(now=True)
+            raise
 
     def _record(self, score: metrics.Score) -> None:
         """Add a validation to the state and its files; keep the weights if they are the best so far."""
@@ -561,6 +572,9 @@ def train(
             trainer.board = Board(run.folder, settings, trainer.state, progress)
             stack.callback(trainer.board.close)
         trainer.rendering = rendering
+        if trainer.state.step == settings.steps and not trainer.state.finished:  # stopped before its last validation
+            trainer.validate_if_due()
+            trainer.save(now=True)
         for batch in batches(windows, settings, trainer.state, process, rendering, held):
             trainer.step(batch)
             interrupted = process.any(should_stop())

@@ -105,6 +105,26 @@ def test_a_killed_run_ends_as_one_that_was_not(source, tmp_path, monkeypatch):
     assert all(torch.equal(one[name], two[name]) for name in one)
 
 
+@pytest.mark.parametrize("length", [("--steps", 4), ("--steps", 8)])
+def test_a_run_that_is_stopped_while_it_waits_for_clips_loses_no_step(source, tmp_path, monkeypatch, length):
+    """Before a validation in the middle, and before the last one: the same command then does what is missing."""
+    waits = iter([True])
+    complete = rendering.Rendering.complete
+
+    def interrupted(self):
+        if next(waits, False):
+            raise KeyboardInterrupt
+        complete(self)
+
+    monkeypatch.setattr(rendering.Rendering, "complete", interrupted)
+    assert train(source, tmp_path / "run", *length, "-q") == 130
+    kept = torch.load(tmp_path / "run/checkpoint.pt", weights_only=True)["state"]
+    assert (kept["step"], kept["finished"]) == (min(6, length[1]), False)
+    assert train(source, tmp_path / "run", *length, "-q") == 0
+    history = json.loads((tmp_path / "run/history.json").read_text())["history"]
+    assert [entry["step"] for entry in history][-1] == length[1]
+
+
 def test_workers_draw_what_this_process_draws(source, tmp_path):
     """Of clips that are there already, so that both runs have one schedule."""
     found = []
