@@ -16,7 +16,7 @@ one clip folder per number, and the licences.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -29,14 +29,13 @@ from qsim import files, limits, opening
 from qsim.clip.clip_info import ClipInfo
 from qsim.clip.source import Source
 from qsim.clip.writer import ClipWriter
-from qsim.kinds import Frames, Seed, Split
+from qsim.kinds import Frames, Part, Seed, Split
 from qsim.scene.image_files import read_grey
 from qsim.scene.textures import noise, pictures_in
 from qsim.settings import setting
 from qsim.streams.clip import Clip
 
 Motion = Annotated[float, Meta(ge=0.0, le=100.0)]  # px/frame
-Part = Annotated[float, Meta(ge=0.0, le=1.0)]  # of clips or layers
 
 FINE = 2  # texels of a layer per pixel, at zoom 1
 SAMPLES = 3  # per pixel along each side
@@ -50,7 +49,10 @@ STRUCK = 0.3  # share of shaking cameras that are struck
 RINGING = (0.25, 0.8)  # rad/frame, of a struck camera
 LEAST_REPEAT = 2  # px, shortest period of a pattern
 MOST_REPEAT = 24  # px, longest
-WINDOWS = 0.5  # share of patterns that are a pane in a wall instead of a part of a picture
+WINDOWS = 0.4  # share of patterns that are a pane in a wall
+GRIDS = 0.3  # share of patterns that are stripes or a checkerboard; the others repeat a part of a picture
+WIDEST = 8  # px, of a stripe or a square
+STRAIGHT = 0.5  # share of patterns in the background whose rows and columns are those of the picture
 
 
 @dataclass(frozen=True)
@@ -156,15 +158,19 @@ def layers(
         camera = _shaking(SHAKE * motion * rng.random(), side, rng)
         largest *= 0.5 * rng.random()  # by itself; shake comes on top
 
-    def light_of(across: int) -> Array:
+    def light_of(across: int) -> tuple[Array, bool]:
         if rng.random() < patterns:
-            return _pattern(pictures, across, rng)
-        return _cut(pictures, across, rng)
+            return _pattern(pictures, across, rng), True
+        return _cut(pictures, across, rng), False
 
-    found = [Layer(light_of(2 * side), None, _path(size, largest, side, rng), camera)]
+    behind, repeats = light_of(2 * side)
+    path = _path(size, largest, side, rng)
+    if repeats and rng.random() < STRAIGHT:
+        path = _straight(path)
+    found = [Layer(behind, None, path, camera)]
     for _ in range(int(rng.integers(0, 5))):
         across = int(side * rng.uniform(0.15, 0.7))
-        light = _tone(across, rng) if rng.random() < SMOOTH else light_of(across)
+        light = _tone(across, rng) if rng.random() < SMOOTH else light_of(across)[0]
         own = largest * rng.choice([0.0, 0.5, 1.0], p=[0.2, 0.3, 0.5])
         found.append(Layer(light, _outline(light.shape, rng), _path(size, own, across / 2, rng), camera))
     return found
@@ -225,6 +231,13 @@ def _path(size: tuple[int, int], largest: float, radius: float, rng: np.random.G
     )
 
 
+def _straight(path: Path2D) -> Path2D:
+    """Return a path without turn and zoom, on which edges of texels are edges of pixels in the middle of the clip."""
+    y, x = (float(round(p)) for p in path.place)
+    quarter = np.pi / 2 * round(path.angle / (np.pi / 2))
+    return replace(path, place=(y, x), angle=quarter, spin=0.0, growth=0.0)
+
+
 def _shaking(largest: float, side: float, rng: np.random.Generator) -> Camera2D:
     """Return a camera that moves points up to `side` px from the origin by at most about `largest` px/frame."""
     if rng.random() < STRUCK:
@@ -251,17 +264,34 @@ def _three(values: Array) -> tuple[float, float, float]:
 
 
 def _pattern(pictures: Sequence[Array], across: int, rng: np.random.Generator) -> Array:
-    """Return a square of `across` px in which a small part repeats: a part of a picture, or a pane in a wall."""
+    """Return a square of `across` px in which a small part repeats: of a picture, a pane in a wall, or a grid."""
+    kind = rng.random()
+    if kind < GRIDS:
+        return _tiled(_grid(rng), FINE * across)
     rows, columns = (round(FINE * np.exp(rng.uniform(np.log(LEAST_REPEAT), np.log(MOST_REPEAT)))) for _ in range(2))
-    if rng.random() < WINDOWS:
+    if kind < GRIDS + WINDOWS:
         wall, pane = np.exp(rng.uniform(np.log(0.02), np.log(0.9), 2))
         part = np.full((rows, columns), wall)
         part[: max(1, int(rows * rng.uniform(0.3, 1.0))), : max(1, int(columns * rng.uniform(0.3, 1.0)))] = pane
     else:
         part = _cut(pictures, max(rows, columns), rng)[:rows, :columns]
-    side = FINE * across
+    return _tiled(part, FINE * across)
+
+
+def _tiled(part: Array, side: int) -> Array:
+    """Return a square of `side` texels that repeats a part."""
     repeats = [-(-side // n) for n in part.shape]
     return np.tile(part, repeats)[:side, :side]
+
+
+def _grid(rng: np.random.Generator) -> Array:
+    """Return a period of stripes along rows or columns, or of a checkerboard, of two tones and 1 to WIDEST px."""
+    width = FINE * round(np.exp(rng.uniform(0, np.log(WIDEST))))
+    dark = np.exp(rng.uniform(np.log(0.005), np.log(0.5)))
+    bright = dark + rng.uniform(0.2, 1.0) * (1 - dark)
+    y, x = np.mgrid[: 2 * width, : 2 * width] // width
+    odd = (y % 2, x % 2, (y + x) % 2)[int(rng.integers(3))]
+    return np.where(odd == 1, bright, dark)
 
 
 def _cut(pictures: Sequence[Array], across: int, rng: np.random.Generator) -> Array:

@@ -11,13 +11,12 @@ import functools
 import io
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Any, Literal, NamedTuple, NotRequired, TypedDict
+from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
 from urllib.parse import unquote
 
 import numpy as np
-from msgspec import Meta
 
-from qsim.kinds import Count, Number
+from qsim.kinds import Count, Number, Part
 from qsim.records import convert
 from qsim.scene.animated.gltf_buffers import Document, data_uri
 from qsim.scene.files_beside import bytes_beside, picture_in
@@ -30,7 +29,6 @@ NEAREST = (9728, 9984, 9986)  # filters that take one texel: NEAREST, and with m
 WEBP = "EXT_texture_webp"
 BASIS = "KHR_texture_basisu"
 
-Part = Annotated[float, Meta(ge=0.0, le=1.0)]
 Factor = tuple[Part, Part, Part, Part]
 Wrap = Literal[10497, 33071, 33648]  # the keys of WRAPS
 

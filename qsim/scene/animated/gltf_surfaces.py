@@ -21,9 +21,10 @@ from msgspec import Meta
 
 from qsim import limits
 from qsim.colour import luminance
+from qsim.kinds import Part
 from qsim.records import convert
 from qsim.scene.animated.gltf_buffers import Document
-from qsim.scene.animated.gltf_materials import Factor, Paints, Part, TextureInfo
+from qsim.scene.animated.gltf_materials import Factor, Paints, TextureInfo
 from qsim.scene.bands import Colour
 from qsim.scene.materials import MetallicRoughness, NormalMap, Picture, Texture, VertexColours
 from qsim.scene.mesh_pieces import Paint, texture_of

@@ -14,12 +14,11 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 import numpy as np
 from msgspec import Meta
 
-from qsim.kinds import Number
+from qsim.kinds import Number, Part
 from qsim.optics.camera import Camera
 from qsim.records import convert
 from qsim.scene.animated.attached import Attached, inverse, placement, rigid_part
 from qsim.scene.animated.gltf_buffers import Document, entries_of
-from qsim.scene.animated.gltf_materials import Part
 from qsim.scene.animated.gltf_surfaces import tint
 from qsim.scene.animated.skinning import Placed
 from qsim.scene.animated.tracks import Clock
