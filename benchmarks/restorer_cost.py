@@ -98,7 +98,7 @@ class Program:
 
 def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=3, help="counted runs of each program (default 3)")
+    parser.add_argument("--runs", type=int, default=2, help="counted runs of each program (default 2)")
     parser.add_argument("--size", default="512x1024", help="HEIGHTxWIDTH, up to 512x1024 (default)")
     parser.add_argument("--busy", action="store_true", help="measure beside other programs; the page says so")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "restorer_cost.md", help="page")
