@@ -49,7 +49,7 @@ class Train:
 @command(
     "quiver train out/starter -o out/mine --minutes 20",
     "quiver train out/starter -o out/unet --preset unet --protocol control --minutes 20",
-    "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
+    "torchrun --nproc-per-node 4 -m -- quiver train out/starter -o out/s --preset quiver-s --protocol published",
     after_interrupt=RESUMES,
 )
 def train(asked: Train, given: Annotated[dict[str, Any], Settings]) -> int:
