@@ -2,11 +2,11 @@
 
     python benchmarks/long_run.py out/starter --steps 1000          # one more part, from the last weights
     python benchmarks/long_run.py out/starter --score               # the newest weights beside classical methods
-    python benchmarks/long_run.py out/starter --page                # the page alone
+    python benchmarks/long_run.py out/starter                       # the page alone
 
 A part begins with the weights that the last one ended with, stored as float16, with an optimiser and a cosine of its
 own. A part that is interrupted resumes by the same command while its run lies in the folder of work. The settings are
-those that learned fastest (docs/results/recipe_rows.md), at lights of 2 to 30 photons.
+those that learned fastest (docs/results/recipe_rows.md), at lights of 2 to 26 photons.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rows import LIGHTS, ROOT, Budget, interval, keep_apart, machine, recipe_digest, scores
+from rows import LIGHTS, ROOT, Budget, interval, keep_apart, machine, recipe_digest, scores, settings_of
 
 from qsim.figures import new_figure, write_figure
 from qsim.files import VERSION, read_json, write_bytes, write_json
@@ -26,7 +26,7 @@ from qsim.tables import markdown_table
 from quiver.model.weights import halved
 
 NETWORK = "quiver-s-1m"
-SETTINGS = ("--frames", "21", "--ppp", "2,3.25,5,9.75,16,26")
+SETTINGS = ("--frames", "21", "--crop", "96", "--ppp", "2,3.25,5,9.75,16,26")
 SMALL = ("--frames", "12", "--crop", "32")  # with --tiny
 VALIDATIONS = 4  # of a part
 BESIDE = ("moment", "qbp-bm3d")
@@ -63,7 +63,6 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--score", action="store_true", help="score the newest weights on the test clips of the data sets"
     )
-    made.add_argument("--page", action="store_true", help="write the page alone")
     made.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "long_run", help="folder of the parts")
     made.add_argument("--work", type=Path, help="folder of runs, which can be deleted (default out/long_run)")
     made.add_argument("--tiny", action="store_true", help="crops of 32 px: a test of this program")
@@ -94,11 +93,11 @@ def add_part(args: argparse.Namespace) -> None:
     line = [str(word) for word in (*several, *module, *words)]
     print(f"\n$ python {shlex.join(line)}", flush=True)
     subprocess.run([sys.executable, *line], check=True)
-    found = read_json(folder / "history.json")
-    row = {"quiver": VERSION, "machine": machine(), "processes": args.processes, "settings": found["settings"]}
+    history = read_json(folder / "history.json")["history"]
+    row = {"quiver": VERSION, "machine": machine(), "processes": args.processes, "settings": settings_of(folder)}
     row |= {"data": [path.name for path in args.data], "recipes": [recipe_digest(path) for path in args.data]}
     write_bytes(weights_of(args.out), halved(folder / "last.safetensors"))
-    write_json(args.out / f"part-{number:02d}.json", row | {"history": found["history"]})
+    write_json(args.out / f"part-{number:02d}.json", row | {"history": history})
 
 
 def score(args: argparse.Namespace) -> None:

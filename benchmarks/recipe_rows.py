@@ -19,7 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,7 @@ from rows import (
     starred,
     wait_for_quiet,
 )
+from rows import settings_of as recorded
 
 from qsim.files import VERSION, read_json, write_bytes, write_json
 from qsim.tables import markdown_table
@@ -260,7 +261,7 @@ def make(name: str, seed: int, args: argparse.Namespace) -> None:
         if not converged(partial(train, values, folder, seed, ("--steps", steps), start, args, budget)):
             store(name, seed, told, None, args, budget)
             return
-        told.append({"seconds": each, "steps": steps, "settings": read_json(folder / "settings.json")})
+        told.append({"seconds": each, "steps": steps, "settings": recorded(folder)})
         start = folder
     assert start is not None
     scored = scores([str(start)], args.work / f"{name}-{seed}-scores", args.data, (LIGHT,), budget, "val")
@@ -286,7 +287,8 @@ def by_the_clock(name: str, seed: int, args: argparse.Namespace) -> None:
     history = read_json(start / "history.json")["history"] if start is not None else []
     row = {"name": name, "seed": seed, "what": WAYS[name].what, "steps": history[-1]["step"], "scores": found}
     others = watch.others()
-    row |= {"budget": asdict(budget), "data": args.data.name, "recipe_sha256": recipe_digest(args.data)}
+    row |= {"budget": {"minutes": budget.minutes, "threads": budget.threads}}
+    row |= {"data": args.data.name, "recipe_sha256": recipe_digest(args.data)}
     write_json(path, row | {"machine": machine(), "quiet": others is not None and others <= QUIET})
     write_page(args.out)
 
@@ -302,7 +304,8 @@ def store(
     """Write a row and the page; `scored` is None for a run that diverged."""
     path = args.out / f"{name}-{seed}.json"
     row = {"quiver": VERSION, "name": name, "what": WAYS[name].what, "seed": seed, "stages": stages, "scores": scored}
-    row |= {"budget": asdict(budget), "data": args.data.name, "recipe_sha256": recipe_digest(args.data)}
+    row |= {"budget": {"minutes": budget.minutes, "threads": budget.threads}}
+    row |= {"data": args.data.name, "recipe_sha256": recipe_digest(args.data)}
     write_json(path, row | {"machine": machine()})
     print(f"{path}: written", flush=True)
     write_page(args.out)

@@ -339,6 +339,13 @@ def best_rate(trials: dict[str, dict[str, Any]]) -> str:
     return max(trials, key=lambda rate: -math.inf if trials[rate]["psnr"] is None else trials[rate]["psnr"])
 
 
+def settings_of(folder: Path) -> dict[str, Any]:
+    """Return the settings of a run; of folders the names alone, as their places are those of one machine."""
+    found: dict[str, Any] = read_json(folder / "settings.json")
+    data = found["data"] if isinstance(found["data"], list) else [found["data"]]
+    return found | {"data": [Path(name).name for name in data], "out": Path(found["out"]).name}
+
+
 def converged(run: Callable[[], None]) -> bool:
     """Run a training; return False if it diverged. Other failures are raised: `CalledProcessError`."""
     try:

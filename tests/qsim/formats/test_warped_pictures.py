@@ -96,17 +96,15 @@ def test_patterns_repeat():
         assert np.ptp(light) > 0
 
 
-def test_some_patterns_are_grids_along_the_pixels():
-    """Still stripes and squares of whole pixels: of a row or a column of the middle frame only two tones remain."""
+def test_grids_lie_along_the_pixels(monkeypatch):
+    """Still stripes and squares in the background have few tones; on turned or shifted ones edges cut pixels."""
+    monkeypatch.setattr("qsim.formats.warped_pictures.GRIDS", 1.0)
+    monkeypatch.setattr("qsim.formats.warped_pictures.STRAIGHT", 1.0)
     rng = np.random.default_rng(7)
-    soft = [rng.random((300, 300))]
-    aligned = 0
-    for _ in range(60):
-        behind = layers(soft, (24, 24), 0.0, rng, patterns=1.0)[0]
+    for _ in range(30):
+        behind = layers([rng.random((300, 300))], (24, 24), 0.0, rng, patterns=1.0)[0]
         light = frame([behind], (24, 24), 0.0)[0]
-        edges = np.unique(np.round(light, 6))
-        aligned += bool(behind.path.spin == 0 and behind.path.angle % (np.pi / 2) == 0 and len(edges) <= 4)
-    assert aligned >= 3
+        assert len(np.unique(np.round(light, 6))) <= 16
 
 
 def test_a_layer_that_slides_moves_by_its_speed():
