@@ -4,13 +4,13 @@
 
     pictures -> layers (a background, bodies of random outline) -> relative radiance, exact flow, one clip per number
 
-They cost a thousandth of a rendered clip, and have no shading and no blur. Pictures become linear light
-and are shrunk to half of their size at least, which removes most of their noise. Every clip draws its largest motion
-from 0 to `motion` px/frame; its layers translate, sway, rotate and zoom up to that. A share of the clips is seen by a
-camera that shakes or is struck; a share of the layers repeats a small part, as facades and grids do. A pixel is the
-mean of 3 x 3 bilinear samples; flow follows from the motion in closed form. Clip n is a function of the pictures,
-`seed` and n. An existing clip is kept, so the same command resumes; one of other settings is refused. The folder holds
-one clip folder per number, and the licences.
+They cost a thousandth of a rendered clip, and have no shading and no blur. Pictures become linear light and are shrunk
+to half of their size at least, which removes most of their noise. Every clip draws its largest motion from 0 to
+`motion` px/frame; its layers translate, sway, rotate and zoom up to that. A share of the clips is seen by a camera that
+shakes or is struck; a share of the layers repeats a small part, as facades and grids do, and some have bright points. A
+pixel is the mean of 3 x 3 bilinear samples; flow follows from the motion in closed form. Clip n is a function of the
+pictures, `seed` and n. An existing clip is kept, so the same command resumes; one of other settings is refused. The
+folder holds one clip folder per number, and the licences.
 """
 
 from __future__ import annotations
@@ -52,6 +52,9 @@ MOST_REPEAT = 24  # px, longest
 WINDOWS = 0.4  # share of patterns that are a pane in a wall
 GRIDS = 0.3  # share of patterns that are stripes or a checkerboard; the others repeat a part of a picture
 WIDEST = 8  # px, of a stripe or a square
+POINTS = 0.08  # share of layers with bright points
+MOST_POINTS = 0.02  # of the pixels of such a layer
+BRIGHTEST = 40  # times the mean light of the layer, of a point
 STRAIGHT = 0.5  # share of patterns in the background whose rows and columns are those of the picture
 
 
@@ -159,9 +162,9 @@ def layers(
         largest *= 0.5 * rng.random()  # by itself; shake comes on top
 
     def light_of(across: int) -> tuple[Array, bool]:
-        if rng.random() < patterns:
-            return _pattern(pictures, across, rng), True
-        return _cut(pictures, across, rng), False
+        repeats = rng.random() < patterns
+        light = _pattern(pictures, across, rng) if repeats else _cut(pictures, across, rng)
+        return _with_points(light, rng) if rng.random() < POINTS else light, repeats
 
     behind, repeats = light_of(2 * side)
     path = _path(size, largest, side, rng)
@@ -292,6 +295,17 @@ def _grid(rng: np.random.Generator) -> Array:
     y, x = np.mgrid[: 2 * width, : 2 * width] // width
     odd = (y % 2, x % 2, (y + x) % 2)[int(rng.integers(3))]
     return np.where(odd == 1, bright, dark)
+
+
+def _with_points(light: Array, rng: np.random.Generator) -> Array:
+    """Return light [h, w] with bright points of one pixel, as sparks and distant lamps are."""
+    sides = [n // FINE for n in light.shape]
+    share = np.exp(rng.uniform(np.log(MOST_POINTS / 100), np.log(MOST_POINTS)))
+    strength = rng.uniform(1, BRIGHTEST) * rng.uniform(0.3, 1.0, sides) * light.mean()
+    points = np.where(rng.random(sides) < share, strength, 0.0)
+    added: Array = light.copy()
+    added[: FINE * sides[0], : FINE * sides[1]] += points.repeat(FINE, 0).repeat(FINE, 1)
+    return added
 
 
 def _cut(pictures: Sequence[Array], across: int, rng: np.random.Generator) -> Array:
