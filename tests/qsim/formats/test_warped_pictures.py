@@ -12,8 +12,10 @@ from scipy import ndimage
 from qsim import files
 from qsim.cli import warped_pictures
 from qsim.formats.warped_pictures import (
+    BRIGHTEST,
     FINE,
     LEAST_REPEAT,
+    MOST_POINTS,
     MOST_REPEAT,
     SHAKE,
     Layer,
@@ -82,8 +84,9 @@ def test_a_shaking_camera_keeps_its_speed_and_changes_direction():
     assert np.median(left) > 0.5
 
 
-def test_patterns_repeat():
+def test_patterns_repeat(monkeypatch):
     """A background that is all pattern: some shift of at most MOST_REPEAT px along each axis gives the same light."""
+    monkeypatch.setattr("qsim.formats.warped_pictures.POINTS", 0.0)
     rng = np.random.default_rng(5)
     soft = [rng.random((300, 300))]
     for _ in range(20):
@@ -98,6 +101,7 @@ def test_patterns_repeat():
 
 def test_grids_lie_along_the_pixels(monkeypatch):
     """Still stripes and squares in the background have few tones; on turned or shifted ones edges cut pixels."""
+    monkeypatch.setattr("qsim.formats.warped_pictures.POINTS", 0.0)
     monkeypatch.setattr("qsim.formats.warped_pictures.GRIDS", 1.0)
     monkeypatch.setattr("qsim.formats.warped_pictures.STRAIGHT", 1.0)
     rng = np.random.default_rng(7)
@@ -105,6 +109,20 @@ def test_grids_lie_along_the_pixels(monkeypatch):
         behind = layers([rng.random((300, 300))], (24, 24), 0.0, rng, patterns=1.0)[0]
         light = frame([behind], (24, 24), 0.0)[0]
         assert len(np.unique(np.round(light, 6))) <= 16
+
+
+def test_points_are_single_bright_pixels(monkeypatch):
+    """Points of a layer fill squares of FINE texels, at most MOST_POINTS of them, and nothing else changes."""
+    monkeypatch.setattr("qsim.formats.warped_pictures.POINTS", 1.0)
+    rng = np.random.default_rng(8)
+    for _ in range(20):
+        light = layers([np.full((300, 300), 0.5)], (60, 60), 0.0, rng)[0].light
+        points = light > np.median(light)
+        squares = points.reshape(points.shape[0] // FINE, FINE, -1, FINE)
+        assert 0 < squares.any((1, 3)).mean() < 1.5 * MOST_POINTS
+        assert np.array_equal(squares.any((1, 3)), squares.all((1, 3)))
+        assert np.ptp(light[~points]) == 0
+        assert light.max() < (BRIGHTEST + 1) * light[~points][0]
 
 
 def test_a_layer_that_slides_moves_by_its_speed():
