@@ -38,6 +38,7 @@ RIVAL = "qbp-bm3d"
 EXPOSURE = 5e-4  # s
 FRAMES = 11
 MIDDLE = 5
+LONG = 21  # frames of a stream whose middle frame becomes the first one
 BITS = (1, 2, 3, 7)
 LEVELS = (0.5, 3.25, 26.0, 100.0)  # PPP that the gain is set for
 SHARES = (0.1, 1.0, 2.0)  # light of a flat field over that level
@@ -187,10 +188,10 @@ def ends(draws: int, size: int) -> dict[str, dict[str, list[float]]]:
         for motion in MOTION:
             row = found[f"{ppp:g} PPP, {motion:g} px/frame"] = {NAME: [], RIVAL: []}
             for n in range(draws):
-                codes, target = moving(motion, ppp, size, n)
-                begun = exchanged(codes, codes.read(MIDDLE, FRAMES))
+                codes, target = moving(motion, ppp, size, n, LONG)
+                begun = exchanged(codes, codes.read(LONG // 2, LONG))
                 for name, lost in row.items():
-                    lost.append(psnr(name, codes, target) - psnr(name, begun, target, 0))
+                    lost.append(psnr(name, codes, target, LONG // 2) - psnr(name, begun, target, 0))
     return found
 
 

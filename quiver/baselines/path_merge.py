@@ -6,8 +6,10 @@
 Frames beside the reference are compared with it; farther ones, in pairs, with the mean of the nearest three. Two
 statistics compare: the squared mean differences of 6 x 6 and of 2 x 2 pixels over their exact variance, averaged
 nearby: 1 where the scene is the same. The first finds large areas at little light, the second edges and textures that
-a path misses by a pixel. The worse one decides. A frame that a path leads out of the picture has no weight, so the ends
-of a stream need no invented frames.
+a path misses by a pixel. The worse one decides. A frame that a path leads out of the picture has no weight.
+
+At the ends of a stream the window is moved, not cut: the first frame has ten of its future. Those farther away than
+half of the window count where a place rests or moves as the camera does. One acceleration does not lead farther.
 
 The count of a pixel is the number of codes whose mean has its noise: (sum of weights)^2 over the sum of squared weights
 times the share of the noise that is left where a moved frame is sampled between its pixels.
@@ -40,7 +42,7 @@ from quiver.baselines.information_domain import InformationDomain, information_d
 from quiver.baselines.paths.light_factors import light_factors
 from quiver.baselines.paths.motion_paths import Moves, moves, none_of
 from quiver.baselines.paths.moved_frames import CHUNK, SCALES, box_mean, enlarged, halved, look_sharply
-from quiver.baselines.sliding_window import check_window, checked_codes, equal_windows, in_units
+from quiver.baselines.sliding_window import check_window, checked_codes, equal_windows, in_units, moved_window
 from quiver.device import is_gpu
 
 # places of frames in the window -> those frames [B, N, H, W] seen where each pixel went, 1 where that lies in the
@@ -56,6 +58,7 @@ LINEAR = 0.5  # of the largest mean code, up to which codes follow light and are
 FLAT = 0.8  # of it, from which they are left as they are: near saturation they hardly follow light
 MOST_SHARE = 2.0  # of a frame in brighter light than the reference; saturated codes would seem to tell everything
 LEAST_NOISE = 0.1  # of a group of frames; a cubic leaves a frame half of its noise
+LED = 5  # frames to which a path of a place's own leads, or half of a longer window
 NEAR = 2  # groups of one frame beside the reference; the other frames are compared with the mean of these three
 
 
@@ -155,10 +158,17 @@ def evened(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Pr
 def merge_along(window: Prepared, offsets: Sequence[int], tables: DomainTables, found: Moves) -> Merged:
     """Return the reference frames of windows [B, K, H, W], merged along motions that are known."""
 
+    reach = max(LED, len(offsets) // 2)
+    with_camera = 1 - found.own[:, 0]
+
     def follow(places: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         frames = torch.stack([window.codes[:, i] for i in places], dim=1)
         times = [offsets[i] for i in places]
-        return look_sharply(frames, found.path, times, window.size, found.shake[:, places])
+        seen, inside, kept = look_sharply(frames, found.path, times, window.size, found.shake[:, places])
+        for n, offset in enumerate(times):
+            if abs(offset) > reach:
+                inside[:, n] *= with_camera
+        return seen, inside, kept
 
     return merge_followed(window, offsets, tables, follow)
 
@@ -284,15 +294,16 @@ def stream(
     *,
     together: int = 1,
 ) -> Iterator[Merged]:
-    """Yield merged frames [B, H, W] of a stream of `length` frames, each after look_ahead(window) more were read.
+    """Yield merged frames [B, H, W] of a stream of `length` frames, each as soon as its window was read.
 
-    `read` returns the codes [H, W] of one frame. A frame is read and pooled once; windows end where the stream ends.
-    Up to `together` successive frames are merged at a time, those near the ends of the stream alone.
+    `read` returns the codes [H, W] of one frame. A frame is read and pooled once. The windows of the first frames reach
+    farther ahead, those of the last ones farther back, so that all have as many frames. Up to `together` successive
+    frames are merged at a time, those near the ends of the stream alone.
     """
     device = torch.device(device)
     tables = domain_tables(domain, device)
     kept: deque[tuple[int, Prepared]] = deque()
-    for part, before, count in equal_windows(frames, window, length, together):
+    for part, before, count in equal_windows(frames, window, length, together, moved_window):
         first = part.start - before
         while kept and kept[0][0] < first:
             kept.popleft()

@@ -3,8 +3,9 @@
     codes [T, H, W] -> for every frame t the sum of the codes of `window` frames around it
 
 A window of w frames covers t - w//2 ... t + (w-1)//2: centred for odd w, one frame more of the past for even w. Single
-pixels (naive, moment, likelihood) take those frames of it that exist. For BM3D, frames before the first and after the
-last are reflections that do not repeat the end frame (-1 is frame 1), several times for short clips.
+pixels (naive, moment, likelihood) take those frames of it that exist. Paths (path_merge) move it into the stream. For
+BM3D, frames before the first and after the last are reflections that do not repeat the end frame (-1 is frame 1),
+several times for short clips.
 """
 
 from __future__ import annotations
@@ -65,6 +66,12 @@ def existing_frames(frame: int, window: int, length: int) -> slice:
     return slice(max(0, frame - window // 2), min(length, frame + look_ahead(window) + 1))
 
 
+def moved_window(frame: int, window: int, length: int) -> slice:
+    """Return the frames of the window around `frame`, moved into a clip of `length` frames where it would reach out."""
+    first = max(0, min(frame - window // 2, length - window))
+    return slice(first, min(first + window, length))
+
+
 def alike(keys: Sequence[Hashable], frames: range, most: int) -> Iterator[range]:
     """Yield successive frames of equal keys, at most `most` at a time; `keys` has one of each frame."""
     first = 0
@@ -74,13 +81,19 @@ def alike(keys: Sequence[Hashable], frames: range, most: int) -> Iterator[range]
             first = i
 
 
-def equal_windows(frames: range, window: int, length: int, most: int) -> Iterator[tuple[range, int, int]]:
+def equal_windows(
+    frames: range,
+    window: int,
+    length: int,
+    most: int,
+    taken: Callable[[int, int, int], slice] = existing_frames,
+) -> Iterator[tuple[range, int, int]]:
     """Yield successive frames whose windows have the same frames beside them, at most `most` at a time; how many frames
-    of such a window come before its own, and how many it has in all.
+    of such a window come before its own, and how many it has in all. `taken` returns the frames of a window.
     """
     shapes = []
     for frame in frames:
-        here = existing_frames(frame, window, length)
+        here = taken(frame, window, length)
         shapes.append((frame - here.start, here.stop - here.start))
     for part in alike(shapes, frames, most):
         yield part, *shapes[part.start - frames.start]

@@ -2,8 +2,9 @@
 
     codes -> path_merge.stream -> merge_inputs -> MergeNet -> phi + deviation x correction -> photons
 
-The stated delay is half a window: five frames. A frame is read, pooled and merged in one pass, tile by tile where the
-memory does not hold it; tiles are blended, since paths reach far. On a GPU many frames are restored at a time.
+The stated delay is half a window: five frames; the first frames wait for a complete window. A frame is read, pooled
+and merged in one pass, tile by tile where the memory does not hold it; tiles are blended, since paths reach far. On a
+GPU many frames are restored at a time.
 """
 
 from __future__ import annotations

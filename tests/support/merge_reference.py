@@ -17,7 +17,6 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from quiver.baselines.information_domain import FLOOR, InformationDomain
-from quiver.baselines.sliding_window import look_ahead
 
 # ---- Moved frames
 
@@ -466,6 +465,8 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
             if offset:
                 moves = displacement(velocity, acceleration, offset)
                 moved[i], inside[i] = look(frame.codes, moves, frame.size, "bicubic")
+                if abs(offset) > max(5, len(window) // 2):
+                    inside[i] *= (velocity == 0).all(0) & (acceleration == 0).all(0)
                 kept[i] = kept_noise_of_cubic(moves)
             else:
                 moved[i] = frame.codes
@@ -542,14 +543,14 @@ def agreement(difference: Tensor, variance: Tensor) -> Tensor:
 def stream(
     read: Callable[[int], Array], length: int, domain: InformationDomain, window: int, frames: range
 ) -> Iterator[Merged]:
-    """Yield merged frames of a stream of `length` frames, each after look_ahead(window) more frames were read.
+    """Yield merged frames of a stream of `length` frames.
 
-    `read` returns the codes [H, W] of one frame. A frame is read and pooled once; windows end where the stream ends.
+    `read` returns the codes [H, W] of one frame. A frame is read and pooled once; windows are moved into the stream.
     """
     kept: deque[tuple[int, Prepared]] = deque()
     for t in frames:
-        first = max(0, t - window // 2)
-        last = min(length - 1, t + look_ahead(window))
+        first = max(0, min(t - window // 2, length - window))
+        last = min(length, first + window) - 1
         while kept and kept[0][0] < first:
             kept.popleft()
         for i in range(kept[-1][0] + 1 if kept else first, last + 1):

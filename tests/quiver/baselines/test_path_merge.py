@@ -149,7 +149,9 @@ def noise_over_stated(rng, sensor, photons, speed, shake, offsets):
     path = tuple(field.expand(24, -1, *filled) for field in (velocity, bend))
     camera = torch.from_numpy(rng.uniform(-shake, shake, (1, len(offsets), 2, 3)).astype(np.float32))
     camera[:, offsets.index(0)] = 0
-    found = pm.merge_along(window, offsets, tables, Moves(path, camera.expand(24, -1, -1, -1)))
+    found = pm.merge_along(
+        window, offsets, tables, Moves(path, torch.ones(24, 1, *filled), camera.expand(24, -1, -1, -1))
+    )
     mean = float(sensor.mean(np.array(photons), EXPOSURE))
     variance = float(sensor.variance(np.array(photons), EXPOSURE))
     error = (found.mean_code[:, :height, :width] - mean) * (found.count[:, :height, :width] / variance).sqrt()
@@ -213,11 +215,11 @@ def test_any_size_and_any_number_of_frames(shape):
         assert restored[0] == pytest.approx(SENSOR.response(EXPOSURE).invert(codes[0], 1), rel=1e-6)
 
 
-def test_saturated_pixels_near_the_ends_saw_the_frames_that_exist():
-    """One saturated plane had the light of eleven."""
+def test_saturated_pixels_of_the_first_frame_saw_the_frames_of_its_window():
+    """One saturated plane had the light of eleven; the window of the first frame is moved into the stream."""
     sensor = BinarySPAD(1.0, 0.0, 1)
     window = 11
-    for length, seen in ((1, 1), (20, 6)):
+    for length, seen in ((1, 1), (6, 6), (20, 11)):
         first = pm.restore(np.ones((length, 16, 16), np.uint8), sensor, EXPOSURE, window=window)[0]
         np.testing.assert_allclose(first, sensor.response(EXPOSURE).cap(seen), rtol=1e-6)
 
@@ -228,13 +230,13 @@ def test_frames_restored_alone_are_those_of_the_stream():
     assert np.array_equal(pm.restore(codes, SENSOR, EXPOSURE, window=5, frames=range(3, 6)), everything[3:6])
 
 
-def test_a_stream_reads_each_frame_once_and_no_further_than_its_delay():
+def test_a_stream_reads_each_frame_once_and_no_further_than_its_window():
     codes = np.random.default_rng(1).integers(0, 8, (9, 16, 16)).astype(np.uint8)
     read = []
     domain = information_domain(SENSOR, EXPOSURE)
     stream = pm.stream(lambda i: read.append(i) or codes[i], 9, domain, 5, range(9))
     for t, _ in enumerate(stream):
-        assert read == list(range(min(t + 3, 9)))
+        assert read == list(range(min(max(t + 3, 5), 9)))
 
 
 def test_threads_change_nothing():
@@ -268,7 +270,9 @@ def test_what_lies_beyond_the_picture_has_no_weight(monkeypatch):
     velocity = torch.zeros(1, 2, 40, 48)
     velocity[:, 1] = 4.0
     still = torch.zeros(1, 11, 2, 3)
-    monkeypatch.setattr(pm, "moves", lambda *_: Moves((velocity, torch.zeros_like(velocity)), still))
+    monkeypatch.setattr(
+        pm, "moves", lambda *_: Moves((velocity, torch.zeros_like(velocity)), velocity[:, 1:].sign(), still)
+    )
     codes = np.random.default_rng(0).integers(0, 8, (11, 40, 44)).astype(np.uint8)
     found = merged(codes, 5)
     column = np.arange(44)
@@ -276,3 +280,26 @@ def test_what_lies_beyond_the_picture_has_no_weight(monkeypatch):
         seen = sum(((column + 4 * offset >= 0) & (column + 4 * offset < 44)).astype(int) for offset in group)
         np.testing.assert_allclose(count[:40, :44], np.broadcast_to(seen, (40, 44)), rtol=1e-4)
     assert np.isfinite(found.mean_code).all()
+
+
+def test_all_frames_of_a_still_stream_hold_as_many_codes():
+    """The first frame had six frames of eleven."""
+    rng = np.random.default_rng(4)
+    light = gaussian_filter(rng.uniform(0, 12, (64, 72)), 2)
+    codes = SENSOR.sample(np.broadcast_to(light, (14, 64, 72)), EXPOSURE, key=Key(4, 0))
+    counts = [float(merged(codes, t).count.mean()) for t in range(14)]
+    assert min(counts) > 9
+    assert max(counts) <= 11.001
+
+
+def test_own_paths_lead_no_farther_than_half_of_the_window(monkeypatch):
+    """Far frames count where the path is not a place's own, and nowhere else."""
+    velocity = torch.zeros(1, 2, 32, 48)
+    own = torch.zeros(1, 1, 32, 48)
+    own[..., 24:] = 1
+    monkeypatch.setattr(pm, "moves", lambda *_: Moves((velocity, velocity), own, torch.zeros(1, 11, 2, 3)))
+    codes = SENSOR.sample(np.full((20, 32, 48), 3.0), EXPOSURE, key=Key(5, 0))
+    count = merged(codes, 0).count
+    assert count[:, :20].mean() > 9
+    assert count[:, 28:].mean() < 6.001
+    np.testing.assert_allclose(merged(codes, 1).count[:, 28:].max(), 7, atol=0.01)

@@ -5,7 +5,16 @@ import pytest
 
 from qsim.sensor.devices import quiver_physical
 from quiver.baselines import moment, naive_mean
-from quiver.baselines.sliding_window import existing_sums, frame_times, look_ahead, reflect, window_frames, window_sums
+from quiver.baselines.sliding_window import (
+    existing_frames,
+    existing_sums,
+    frame_times,
+    look_ahead,
+    moved_window,
+    reflect,
+    window_frames,
+    window_sums,
+)
 
 EXPOSURE = 5e-4
 
@@ -29,6 +38,18 @@ def test_sums_of_existing_frames_are_those_of_the_cut_window(window):
             there = [n for n in range(t - window // 2, t + look_ahead(window) + 1) if 0 <= n < 7]
             assert count == len(there)
             np.testing.assert_array_equal(total, codes[there].astype(int).sum(axis=0))
+
+
+@pytest.mark.parametrize("window", [1, 2, 3, 4, 11])
+@pytest.mark.parametrize("length", [1, 2, 7, 30])
+def test_moved_windows_have_as_many_frames_as_there_are_and_the_own_one(window, length):
+    for t in range(length):
+        taken = moved_window(t, window, length)
+        cut = existing_frames(t, window, length)
+        assert 0 <= taken.start <= t < taken.stop <= length
+        assert taken.stop - taken.start == min(window, length)
+        assert taken.start <= cut.start
+        assert cut.stop <= taken.stop
 
 
 def test_reflection_goes_on_and_on():
