@@ -105,7 +105,8 @@ def look(
     rows, columns = image.shape if size is None else size
     y = torch.arange(height, dtype=image.dtype)[:, None] + moved[0]
     x = torch.arange(width, dtype=image.dtype)[None] + moved[1]
-    inside = (y >= -0.5) & (y <= rows - 0.5) & (x >= -0.5) & (x <= columns - 0.5)
+    beyond = 0 if mode == "bicubic" else 0.5
+    inside = (y >= -beyond) & (y <= rows - 1 + beyond) & (x >= -beyond) & (x <= columns - 1 + beyond)
     grid = torch.stack([x.mul_(2 / max(width - 1, 1)).sub_(1), y.mul_(2 / max(height - 1, 1)).sub_(1)], dim=-1)
     seen = functional.grid_sample(image[None, None], grid[None], mode=mode, padding_mode="border", align_corners=True)
     return seen[0, 0], inside.to(image.dtype)

@@ -115,7 +115,10 @@ def look_with_noise(
 def look_sharply(
     frames: Tensor, path: Path, offsets: Sequence[int], size: tuple[int, int], camera: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what `look` does at full size, by cubics, and the share of the noise's variance that is left there."""
+    """Return what `look` does at full size, by cubics, and the share of the noise's variance that is left there.
+
+    No place is inside beyond the middle of the last pixel: it is seen as that pixel alone, which has more noise.
+    """
     seen, inside, kept = _looked(frames, path, offsets, 1, size, camera, kept_noise_of_cubic, "bicubic")
     assert kept is not None
     return seen, inside, kept
@@ -144,7 +147,8 @@ def _looked(
     velocity, acceleration = (field.flip(1)[:, None] / scale for field in path)  # (right, down), as grids have it
     rows = velocity.shape[-2]
     first, unit = _lattice(height, width, rows, frames.device)
-    last = [side - 0.5 for side in size or (height, width)]
+    last = [side - 1 for side in size or (height, width)]
+    beyond = 0.0 if mode == "bicubic" else 0.5
     times = powers(tuple(offsets), frames.device)
     cells = batch * rows * width
     step = count if is_gpu(frames.device) else max(1, min(count, CHUNK // cells))
@@ -162,7 +166,7 @@ def _looked(
             place = _led(camera[:, part] / scale, place)
             if kept is not None:
                 found[2].append(kept(place))
-        found[1].append(_within(place[:, :, 0], last[1]).mul_(_within(place[:, :, 1], last[0])))
+        found[1].append(_within(place[:, :, 0], last[1], beyond).mul_(_within(place[:, :, 1], last[0], beyond)))
         grid = place.mul_(unit).sub_(1).flatten(0, 1).permute(0, 2, 3, 1)
         images = frames[:, part].reshape(-1, 1, height, width)
         seen = functional.grid_sample(images, grid, mode=mode, padding_mode="border", align_corners=True)
@@ -209,9 +213,12 @@ def _lattice(height: int, width: int, rows: int, device: torch.device) -> tuple[
     return places, unit.to(device)
 
 
-def _within(place: Tensor, last: float) -> Tensor:
-    """Return 1 where a place lies between -0.5 and `last`, else 0. Floats: a truth value takes five times as long."""
-    return place.clamp(-0.5, last).eq_(place)
+def _within(place: Tensor, last: int, beyond: float) -> Tensor:
+    """Return 1 where a place lies from 0 to `last`, or as little `beyond`, else 0.
+
+    Floats: a truth value takes five times as long.
+    """
+    return place.clamp(-beyond, last + beyond).eq_(place)
 
 
 def halved(image: Tensor) -> Tensor:

@@ -160,9 +160,7 @@ def noise_over_stated(rng, sensor, photons, speed, shake, offsets):
 
 @pytest.mark.parametrize("seed", range(16))
 def test_counts_state_the_noise_at_any_speed_and_anywhere(seed):
-    """Over sensors, light, sizes, places in time, paths that bend and a shaking camera; along the border, too, where
-    places beyond the last pixel are seen as that pixel.
-    """
+    """Over sensors, light, sizes, places in time, paths that bend and a shaking camera; along the border, too."""
     rng = np.random.default_rng(seed)
     sensor = [SENSOR, BinarySPAD(1.0, 0.0, 1), QIS(0.8, 1.6, 0.2, 5)][seed % 3]
     photons = [3.25, 0.7, 9.0][seed % 3]
@@ -174,7 +172,7 @@ def test_counts_state_the_noise_at_any_speed_and_anywhere(seed):
     assert np.sqrt(squares.mean()) == pytest.approx(1, abs=0.03)
     rim = np.ones(squares.shape[1:], bool)
     rim[2:-2, 2:-2] = False
-    assert np.sqrt(squares[:, rim].mean()) == pytest.approx(1, abs=0.06)
+    assert np.sqrt(squares[:, rim].mean()) == pytest.approx(1, abs=0.03)
 
 
 @pytest.mark.parametrize("speed", [1.5, 6.0, 14.0])
