@@ -50,6 +50,10 @@ class DomainOfWeights:
         ),
     ] = None
     seed: Annotated[Seed | None, setting("seed of the noise", unset="0")] = None
+    classical_of: Annotated[
+        str | None,
+        setting("measured weights whose classical scores are taken", unset="all are measured", known=method_names),
+    ] = None
     force: Annotated[bool, setting("measure existing cells again")] = False
 
 
@@ -57,7 +61,7 @@ MEASURING = ("split", "sensor", "bits", "ppp", "methods", "seed", "memory", "mod
 IDLE = (
     Idle(
         lambda asked, *_: "" if asked.clips else "is for measuring, and no clips are given",
-        (*MEASURING, "force"),
+        (*MEASURING, "classical_of", "force"),
     ),
     Idle(
         lambda asked, *_: (
@@ -100,7 +104,8 @@ def domain(asked: DomainOfWeights, options: RestoreOptions, limit: Threads) -> i
         refuse_idle(given(options), [network_restorer(path, options)])
         use_threads(limit.threads)
         with bar("cells", "cell") as progress:
-            found: Domain | None = measure(path, settings, options, progress, force=asked.force)
+            rivals = None if asked.classical_of is None else weights_path(asked.classical_of)
+            found: Domain | None = measure(path, settings, options, progress, force=asked.force, classical_of=rivals)
     else:
         load(path)  # names a damaged file
         found = read_scope(path, metadata_of(path)).domain

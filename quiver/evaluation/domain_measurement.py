@@ -11,7 +11,7 @@ import contextlib
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -87,12 +87,15 @@ def measure(
     progress: Progress | None = None,
     *,
     force: bool = False,
+    classical_of: Path | None = None,
 ) -> Domain:
     """Measure the missing cells of a weights file, and store each in its metadata at once.
 
     Several processes may measure one file. With `force`, requested cells are measured again, and cells measured
-    otherwise (other clips, methods, seed or version) are removed. The tensors of the file are unchanged.
-    `ValueError` for methods that are not classical, and for cells measured otherwise without `force`.
+    otherwise (other clips, methods, seed or version) are removed. The tensors of the file are unchanged. The scores of
+    classical methods are taken from the weights `classical_of` if given, and then only the network is measured.
+    `ValueError` for methods that are not classical, for cells measured otherwise without `force`, and for cells that
+    `classical_of` lacks.
     """
     methods = restorers(settings.methods, options)
     network = network_restorer(weights, options)
@@ -107,13 +110,14 @@ def measure(
             f"{weights}: holds {len(before.cells)} cells that were measured otherwise (not the same: "
             f"{', '.join(changed)}); measure into a copy of the file, or replace them with force=True"
         )
+    rivals = None if classical_of is None else _rivals(classical_of, shared, settings.lights)
     todo = [light for light in settings.lights if force or not _known(weights, shared, light)]
     for done, light in enumerate(todo):
         if progress is not None:
             progress(done, len(todo))
         if not force and _known(weights, shared, light):  # measured by another process in the meantime
             continue
-        cell = measure_cell(network, methods, settings, light)
+        cell = measure_cell(network, methods, settings, light, None if rivals is None else rivals[light])
         with _one_at_a_time(weights):
             # Read again under the lock: another process may have added cells since.
             old = stored(weights, shared)
@@ -121,6 +125,25 @@ def measure(
     if progress is not None:
         progress(len(todo), max(1, len(todo)))
     return stored(weights, shared)
+
+
+def _rivals(source: Path, shared: Mapping[str, object], lights: Sequence[Illumination]) -> dict[Illumination, Cell]:
+    """Return the cells of other weights at these lights. `ValueError` for one that lacks or was measured otherwise."""
+    domain = read_scope(source, metadata_of(source)).domain
+    if domain is None:
+        raise ValueError(f"{source}: was never measured; name weights whose classical scores are known, or none")
+    changed = changes(domain.measured, shared)
+    if changed:
+        raise ValueError(
+            f"{source}: was measured otherwise (not the same: {', '.join(changed)}); its classical scores do not hold"
+        )
+    found = {}
+    for light in lights:
+        cells = [cell for cell in domain.cells if _measures(cell, light)]
+        if not cells:
+            raise ValueError(f"{source}: holds no cell of {light.label}; leave this light out, or measure all methods")
+        found[light] = cells[0]
+    return found
 
 
 def _run_of(network: Restorer, clips: Sequence[Clip]) -> dict[str, object]:
@@ -160,8 +183,21 @@ def _measures(cell: Cell, light: Illumination) -> bool:
     return (cell.sensor, cell.place.bits, cell.ppp) == (Path(light.sensor).name, light.bits, light.ppp)
 
 
-def measure_cell(network: Restorer, methods: Sequence[Restorer], settings: DomainSettings, light: Illumination) -> Cell:
-    """Return the cell of the network and the best method at one light. `ValueError` where a clip has no score."""
+def measure_cell(
+    network: Restorer,
+    methods: Sequence[Restorer],
+    settings: DomainSettings,
+    light: Illumination,
+    rival: Cell | None = None,
+) -> Cell:
+    """Return the cell of the network and the best method at one light, of a `rival` cell if its scores are known.
+    `ValueError` where a clip has no score.
+    """
+    if rival is not None:
+        own = _mean_score(network, settings, light)
+        if not math.isfinite(own):
+            raise ValueError(f"{light.label}: the network fails or has no score on these clips")
+        return replace(rival, network=round(own, 3))
     own, *others = (_mean_score(method, settings, light) for method in (network, *methods))
     if not math.isfinite(own) or any(map(math.isinf, others)) or all(map(math.isnan, others)):
         raise ValueError(f"{light.label}: the network, or every classical method, fails or has no score on these clips")

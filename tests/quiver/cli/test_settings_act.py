@@ -209,6 +209,13 @@ SITUATIONS = (
     Situation(CELLS_NET.replace(" --mode streaming", ""), seen("score"), {"mode": "streaming"}, only=("mode",)),
     Situation(CELLS, cells, only=("methods",)),
     Situation(CELLS, seen("cell"), before=CELLS, only=("force",)),
+    Situation(
+        CELLS,
+        seen("score"),
+        {"classical_of": "small.safetensors"},
+        before=CELLS.replace("unet", "small"),
+        only=("classical_of",),
+    ),
     # ablate, bench, convert-weights
     Situation(ABLATE, lambda run: (tensors(run), scores(run))),
     Situation(ABLATE.replace("--steps 1", "--steps 2"), tensors, only=("minutes", "steps", "crop", "batch")),
@@ -234,6 +241,7 @@ COMMANDS = Commands(
     SITUATIONS,
     words={
         "bits": "1",
+        "classical_of": "small.safetensors",
         "defects": "bad.npy",
         "device": "cuda",
         "domain.ppp": "9",
@@ -318,7 +326,7 @@ def scale() -> Iterator[None]:
     loader = loop.DataLoader
 
     def one_cell(*args: Any) -> Cell:
-        see("cell", args[-1])
+        see("cell", args[3])
         return measure_cell(*args)
 
     def one_score(*args: Any) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,9 +36,9 @@ def test_cells_are_measured_stored_and_kept(tiny_dataset, tmp_path, monkeypatch)
     asked: list[Illumination] = []
     measured = domain_measurement.measure_cell
 
-    def noted(network, methods, settings, light):
+    def noted(network, methods, settings, light, rival):
         asked.append(light)
-        return measured(network, methods, settings, light)
+        return measured(network, methods, settings, light, rival)
 
     monkeypatch.setattr(domain_measurement, "measure_cell", noted)
     found = domain_measurement.measure(path, settings, RestoreOptions(device="cpu"))
@@ -71,11 +72,39 @@ def test_cells_are_measured_stored_and_kept(tiny_dataset, tmp_path, monkeypatch)
         domain_measurement.clips_of([tiny_dataset], "none")
 
 
+def test_classical_scores_are_taken_from_other_weights_on_the_same_clips(tiny_dataset, tmp_path, monkeypatch):
+    """The network alone is restored, and its cells are those of a complete measurement."""
+    old = weights(tmp_path)
+    new = Path(shutil.copyfile(old, tmp_path / "new.safetensors"))
+    clips = domain_measurement.clips_of([tiny_dataset], "test")
+    lights = (Illumination.of(ppp=3.25), Illumination.of("spad-320x240", 1.0, 1))
+    settings = domain_measurement.DomainSettings(clips, lights, ("naive", "moment:3"))
+    options = RestoreOptions(device="cpu")
+    with pytest.raises(ValueError, match="was never measured; name weights whose classical scores"):
+        domain_measurement.measure(new, settings, options, classical_of=old)
+    complete = domain_measurement.measure(old, settings, options)
+    restored: list[str] = []
+    score = domain_measurement.score
+
+    def noted(method, *others):
+        restored.append(method.name)
+        return score(method, *others)
+
+    monkeypatch.setattr(domain_measurement, "score", noted)
+    assert domain_measurement.measure(new, settings, options, classical_of=old) == complete
+    assert set(restored) == {network_restorer(new, options).name}
+    with pytest.raises(ValueError, match="not the same: seed"):
+        domain_measurement.measure(new, replace(settings, seed=1), options, force=True, classical_of=old)
+    dark = replace(settings, lights=(Illumination.of(ppp=0.5),))
+    with pytest.raises(ValueError, match=r"holds no cell of .*0\.5"):
+        domain_measurement.measure(new, dark, options, classical_of=old)
+
+
 def cells_without_measuring(monkeypatch: pytest.MonkeyPatch) -> list[Illumination]:
     """Let cells cost nothing; return the list that collects their lights."""
     asked: list[Illumination] = []
 
-    def at_once(network: Restorer, methods: object, settings: object, light: Illumination) -> Cell:
+    def at_once(network: Restorer, methods: object, settings: object, light: Illumination, rival: object) -> Cell:
         asked.append(light)
         place = domain.place_of(light.device(5e-4), 5e-4, light.ppp)
         return Cell(Path(light.sensor).name, light.ppp, place, 20.0, "naive", 19.0)
