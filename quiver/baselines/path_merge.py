@@ -133,8 +133,20 @@ def merge(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Mer
     window = evened(window, offsets, tables)
     pooled = halved(window.codes)
     # The noise that the search for paths expects, from the window without motion: only its size matters there.
-    deviation = tables.variance(box_mean(pooled.mean(1), 2)).sqrt()
+    variance = tables.variance(box_mean(pooled.mean(1), 2))[:, None]
+    deviation = (variance if window.shares is None else variance * _about_mean(window.shares)).sqrt()
     return merge_along(window, offsets, tables, moves(window.pyramid, offsets, pooled, deviation))
+
+
+def _about_mean(shares: Tensor) -> Tensor:
+    """Return the variance of frames about the mean of all, over that of the reference's codes, [B, K, 1, 1].
+
+    A frame has 1 / share of that variance; the part 1 - 1/K of it is taken off elsewhere.
+    """
+    frames = shares.shape[1]
+    own = shares.reciprocal()
+    about = own * (1 - 2 / frames) + own.mean(1, keepdim=True) / frames
+    return (about / (1 - 1 / frames))[..., None, None]
 
 
 def evened(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Prepared:

@@ -87,7 +87,7 @@ def moves(pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, dev
     fine = SCALES[-1]
     camera = camera_motion(pyramid, offsets)
     smooth, shake = parted(camera, offsets)
-    unit = (fine / deviation)[:, None]
+    unit = fine / deviation
     rest = _spread(look_still(codes), None, None, unit)
     mean = seen_without(pyramid[fine], camera, fine)[0].mean(1)
     whole = _spread(*seen_with_noise(codes, camera, fine), unit)
@@ -153,10 +153,11 @@ def paths(
     where a place has a path of its own, else 0, [B, 1, H, W].
 
     `offsets` are the frames' places in time; 0 is the reference. The noise of a frame at a scale has the deviation
-    1 / scale, as phi of pooled codes nearly has. Mean `codes` [B, K, H/2, W/2] of scale 2 and the `deviation`
-    [B, H/2, W/2] of one code tell what moves: of four codes of one bit, phi has up to 1.8 times that variance. A path
-    must fit better than no motion, or than the `smooth` motion of the camera, velocity and acceleration [B, 2, 2, 3].
-    The misfits [B, h, w] of that motion may be known: `still`, as `_spread` returns them.
+    1 / scale, as phi of pooled codes nearly has. Mean `codes` [B, K, H/2, W/2] of scale 2 and the `deviation` of one
+    code, [B, K, H/2, W/2], or [B, 1, H/2, W/2] where it is that of all frames, tell what moves: of four codes of one
+    bit, phi has up to 1.8 times that variance. A path must fit better than no motion, or than the `smooth` motion of
+    the camera, velocity and acceleration [B, 2, 2, 3]. The misfits [B, h, w] of that motion may be known: `still`, as
+    `_spread` returns them.
     """
     coarse, middle, fine = (pyramid[scale] for scale in SCALES)
     shape = middle.shape[-2:]
@@ -212,7 +213,7 @@ def moving(
     `still` if they are known.
     """
     radius, margin = STILL
-    unit = (SCALES[-1] / deviation)[:, None]
+    unit = SCALES[-1] / deviation
     least: Tensor | float = margin
     if base is not None:
         least = torch.where(base.abs().amax((1, 2)) > 0, PAN, margin)

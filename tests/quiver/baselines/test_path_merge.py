@@ -301,3 +301,27 @@ def test_own_paths_lead_no_farther_than_half_of_the_window(monkeypatch):
     assert count[:, :20].mean() > 9
     assert count[:, 28:].mean() < 6.001
     np.testing.assert_allclose(merged(codes, 1).count[:, 28:].max(), 7, atol=0.01)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_light_that_fades_is_not_taken_for_motion(seed):
+    """Codes of dark frames have more noise after they are evened out: paths between pixels, which have less, fitted
+    better than none on more than half of the places.
+    """
+    rng = np.random.default_rng(seed)
+    texture = np.exp(0.5 * gaussian_filter(rng.normal(size=(128, 128)), 1.5) / 0.19)
+    fading = np.linspace(1.3, 0.4, 11)[:, None, None] * 3.25 * texture / texture.mean()
+    codes = SENSOR.sample(fading, EXPOSURE, key=Key(seed, 3))
+    domain = information_domain(SENSOR, EXPOSURE)
+    tables = domain_tables(domain, torch.device("cpu"))
+    seen: list[Moves] = []
+    found = pm.moves
+
+    def noted(*given):
+        seen.append(found(*given))
+        return seen[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pm, "moves", noted)
+        pm.merge(pm.prepared(torch.from_numpy(codes)[None], tables), range(-5, 6), tables)
+    assert seen[0].own.mean() < 0.05

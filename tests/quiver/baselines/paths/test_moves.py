@@ -22,7 +22,7 @@ def noisy(frames: torch.Tensor, contrast: float, rng: np.random.Generator) -> to
 def moved(frames: torch.Tensor):
     """Return what `moves` finds in frames [B, K, H, W] whose noise has the deviation 1."""
     codes = functional.avg_pool2d(frames, 2)
-    return moves(pyramid_of(frames), OFFSETS, codes, torch.ones(len(frames), *codes.shape[-2:]))
+    return moves(pyramid_of(frames), OFFSETS, codes, torch.ones(len(frames), 1, *codes.shape[-2:]))
 
 
 def test_at_rest_the_camera_is_exactly_still():
