@@ -28,6 +28,7 @@ from quiver.baselines.paths.moved_frames import box_mean, kept_noise
 SCALE = 4  # px per cell, at which frames are registered
 DETAIL = 4  # cells: structure wider than twice this, as of light that changes, does not count in a correlation
 REACH = 4  # cells from where the last two frames lead, at which a shift is looked for
+SUDDEN = 0.1  # cells that a shift is away from there, at which it is e times less likely
 STEPS = ((4, 1), (2, 3), (2, 3))  # of Gauss-Newton: scale; 1 for a shift, 3 for an affine motion
 MOST = 1.0  # cells, largest correction of one step
 MISFIT = 3.0  # variances of the noise at which a place has half a vote
@@ -71,7 +72,7 @@ def shifts(frames: Tensor, offsets: Sequence[int]) -> Tensor:
         template = torch.fft.rfft2(mean - box_mean(mean, DETAIL), s=(2 * height, 2 * width))
         places = [offsets.index(offset) for offset in here]
         likeness = torch.fft.irfft2(spectra[:, places] * template.conj()[:, None], s=(2 * height, 2 * width))
-        moved = _peak(likeness, guess)
+        moved = _peak(likeness * SCALE**2, guess)  # a cell's noise has the variance 1 / SCALE^2
         for n, offset in enumerate(here):
             found[offset] = moved[:, n]
         motion = functional.pad(moved.unsqueeze(-1), (0, 2))
@@ -91,7 +92,8 @@ def _led_to(found: dict[int, Tensor], offset: int) -> Tensor:
 def _peak(likeness: Tensor, guess: Tensor) -> Tensor:
     """Return the shift [B, N, 2] at the peak of likeness [B, N, H, W], REACH cells around the guess [B, N, 2] at most.
 
-    Shifts count from 0 upwards and, backwards, from the end. A parabola places the peak between cells.
+    `likeness` is a logarithm of the likelihood. A facade looks the same one window farther: shifts far from the guess
+    are less likely. Shifts count from 0 upwards and, backwards, from the end. A parabola places the peak between cells.
     """
     height, width = likeness.shape[-2:]
     start = guess.round().to(torch.int64) - REACH - 1
@@ -100,6 +102,8 @@ def _peak(likeness: Tensor, guess: Tensor) -> Tensor:
     columns = (start[..., 1, None] + side) % width
     index = rows[..., :, None] * width + columns[..., None, :]
     near = likeness.flatten(2).gather(2, index.flatten(2)).view(index.shape)
+    away = ((start[..., None] + side) - guess[..., None]).square()
+    near = near - (away[..., 0, :, None] + away[..., 1, None, :]).sqrt() / SUDDEN
     inner = near[..., 1:-1, 1:-1].flatten(2)
     best = inner.argmax(-1)
     row = best // (2 * REACH + 1) + 1

@@ -60,6 +60,7 @@ BLOCK = 8  # cells of scale 2: side of the blocks that vote on the camera's moti
 CERTAIN = 4.0  # of a motion's square in deviations of the noise, at which a block has half a vote
 AGREE = 0.3  # of the votes that are expected if all blocks move as the camera does
 SURE = 3.0  # deviations of the votes of blocks that know nothing
+PANS = 2 / 3  # of AGREE and SURE suffices for a motion that is smooth in time: paths of their own can leave it
 DETAIL = (6, 40.0)  # radius of the block [cells of scale 2] over which slow paths must fit better, and by how much
 REFINE = ((4, 2, 2), (2, 4, 3))  # (scale, radius of the mean that is taken twice, in cells; iterations)
 CORRECTION = 1.0  # px/frame, expected size of a correction of v
@@ -91,7 +92,7 @@ def moves(pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, dev
     rest = _spread(look_still(codes), None, None, unit)
     mean = seen_without(pyramid[fine], camera, fine)[0].mean(1)
     whole = _spread(*seen_with_noise(codes, camera, fine), unit)
-    pans = agrees(rest - whole, told(mean, camera))
+    pans = agrees(rest - whole, told(mean, camera), PANS)
     if none_of(pans):
         return Moves(*paths(pyramid, offsets, codes, deviation, still=rest), torch.zeros_like(shake))
     steady = _spread(*seen_with_noise(codes, camera - shake, fine), unit)
@@ -126,8 +127,9 @@ def told(mean: Tensor, camera: Tensor) -> Tensor:
     return both.mul_(pull).sum(1).clamp_(min=0)  # of cells / scale px over 1 / scale of noise
 
 
-def agrees(gain: Tensor, told: Tensor) -> Tensor:
-    """Return whether frames move as their camera does, bool [B], from what their cells gain and tell [B, h, w].
+def agrees(gain: Tensor, told: Tensor, share: float = 1.0) -> Tensor:
+    """Return whether frames move as their camera does, bool [B], from what their cells gain and tell [B, h, w]; with
+    this share of the votes that are asked for.
 
     Blocks vote, each with the certainty of its answer: a body that moves has few of them, however much it gains.
     """
@@ -138,7 +140,8 @@ def agrees(gain: Tensor, told: Tensor) -> Tensor:
     expected = (certain * torch.erf((tells / 8).sqrt())).sum(1)
     votes = (certain * gains.sign()).sum(1)
     by_chance = certain.square().sum(1).sqrt()
-    return (votes > AGREE * expected) & (votes > SURE * by_chance) & (gain.flatten(1).sum(1) > GAIN)
+    enough = (votes > share * AGREE * expected) & (votes > share * SURE * by_chance)
+    return enough & (gain.flatten(1).sum(1) > GAIN)
 
 
 def paths(

@@ -7,7 +7,7 @@ import pytest
 import torch
 from shaken import OFFSETS, filmed, pyramid_of, scenery, shake
 
-from quiver.baselines.paths.camera_motion import SMALLEST, camera_motion, field, seen_without
+from quiver.baselines.paths.camera_motion import SMALLEST, _peak, camera_motion, field, seen_without
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -63,3 +63,13 @@ def test_small_and_flat_frames_have_no_motion():
     assert not camera_motion(pyramid_of(small), OFFSETS).any()
     flat = torch.zeros(1, 11, 64, 64)
     assert torch.isfinite(camera_motion(pyramid_of(flat), OFFSETS)).all()
+
+
+@pytest.mark.parametrize(("lead", "taken"), [(20.0, 1), (60.0, 4)])
+def test_a_facade_is_not_seen_one_window_farther(lead, taken):
+    """Three cells farther away its likelihood must be e^30 times as high: walls look alike there but for noise."""
+    likeness = torch.zeros(1, 1, 40, 48)
+    for column, height in ((1, 100.0), (4, 100.0 + lead)):
+        likeness[0, 0, 0, column] = height
+    found = _peak(likeness, torch.zeros(1, 1, 2))
+    torch.testing.assert_close(found[0, 0], torch.tensor([0.0, float(taken)]), atol=0.1, rtol=0)
