@@ -141,10 +141,11 @@ def merge(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Mer
 def _about_mean(shares: Tensor) -> Tensor:
     """Return the variance of frames about the mean of all, over that of the reference's codes, [B, K, 1, 1].
 
-    A frame has 1 / share of that variance; the part 1 - 1/K of it is taken off elsewhere.
+    A frame has 1 / share of that variance; the part 1 - 1/K of it is taken off elsewhere. Brighter frames count as the
+    reference: near saturation they have more noise than their mean light tells.
     """
     frames = shares.shape[1]
-    own = shares.reciprocal()
+    own = shares.clamp(max=1).reciprocal()
     about = own * (1 - 2 / frames) + own.mean(1, keepdim=True) / frames
     return (about / (1 - 1 / frames))[..., None, None]
 

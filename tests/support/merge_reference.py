@@ -81,6 +81,15 @@ def cubic_weights(part: Tensor) -> Tensor:
     return torch.stack([beyond(1 + part), beside(part), beside(1 - part), beyond(2 - part)])
 
 
+def in_picture(moved: Tensor, size: tuple[int, int] | None = None) -> Tensor:
+    """Return where pixels go by moved [2, H, W], at the last pixels of `size` where that lies beyond them."""
+    height, width = moved.shape[-2:]
+    rows, columns = (height, width) if size is None else size
+    y = (torch.arange(height, dtype=moved.dtype)[:, None] + moved[0]).clamp(0, rows - 1)
+    x = (torch.arange(width, dtype=moved.dtype)[None] + moved[1]).clamp(0, columns - 1)
+    return torch.stack([y, x])
+
+
 def kept_noise_of_cubic(moved: Tensor) -> Tensor:
     """Return the share of the noise's variance [..., H, W] that is left at p + moved [2, ..., H, W], seen by `look` of
     cubics.
@@ -105,8 +114,7 @@ def look(
     rows, columns = image.shape if size is None else size
     y = torch.arange(height, dtype=image.dtype)[:, None] + moved[0]
     x = torch.arange(width, dtype=image.dtype)[None] + moved[1]
-    beyond = 0 if mode == "bicubic" else 0.5
-    inside = (y >= -beyond) & (y <= rows - 1 + beyond) & (x >= -beyond) & (x <= columns - 1 + beyond)
+    inside = (y >= -0.5) & (y <= rows - 0.5) & (x >= -0.5) & (x <= columns - 0.5)
     grid = torch.stack([x.mul_(2 / max(width - 1, 1)).sub_(1), y.mul_(2 / max(height - 1, 1)).sub_(1)], dim=-1)
     seen = functional.grid_sample(image[None, None], grid[None], mode=mode, padding_mode="border", align_corners=True)
     return seen[0, 0], inside.to(image.dtype)
@@ -332,7 +340,7 @@ def _spread(codes: Tensor, deviation: Tensor, offsets: Sequence[int], velocity: 
     seen, there = (torch.stack(x) for x in zip(*map(look, codes, moved), strict=True))
     count = there.sum(0)
     mean = (seen * there).sum(0) / count
-    noise = torch.stack([kept_noise(x) for x in moved]) * (1 - 1 / count)
+    noise = torch.stack([kept_noise(in_picture(x)) for x in moved]) * (1 - 1 / count)
     return torch.where(there > 0, misfit((seen - mean) * (scale / deviation), noise), 1.0).sum(0)
 
 
@@ -468,7 +476,7 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
                 moved[i], inside[i] = look(frame.codes, moves, frame.size, "bicubic")
                 if abs(offset) > max(5, len(window) // 2):
                     inside[i] *= (velocity == 0).all(0) & (acceleration == 0).all(0)
-                kept[i] = kept_noise_of_cubic(moves)
+                kept[i] = kept_noise_of_cubic(in_picture(moves, frame.size))
             else:
                 moved[i] = frame.codes
         weight = weights(moved, inside, offsets, domain)

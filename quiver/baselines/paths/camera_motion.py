@@ -163,7 +163,7 @@ def seen_with_noise(frames: Tensor, motion: Tensor, scale: int) -> tuple[Tensor,
     height, width = frames.shape[-2:]
     moved = places(motion, height, width, scale).add_(1)
     for place, side in zip(moved.unbind(2), (width, height), strict=True):
-        place.mul_(side / 2).sub_(0.5)
+        place.mul_(side / 2).sub_(0.5).clamp_(0, side - 1)
     return *seen_without(frames, motion, scale), kept_noise(moved)
 
 

@@ -117,7 +117,7 @@ def look_sharply(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return what `look` does at full size, by cubics, and the share of the noise's variance that is left there.
 
-    No place is inside beyond the middle of the last pixel: it is seen as that pixel alone, which has more noise.
+    Half a pixel beyond the middle of the last pixel a place is seen as that pixel alone, with all of its noise.
     """
     seen, inside, kept = _looked(frames, path, offsets, 1, size, camera, kept_noise_of_cubic, "bicubic")
     assert kept is not None
@@ -148,7 +148,6 @@ def _looked(
     rows = velocity.shape[-2]
     first, unit = _lattice(height, width, rows, frames.device)
     last = [side - 1 for side in size or (height, width)]
-    beyond = 0.0 if mode == "bicubic" else 0.5
     times = powers(tuple(offsets), frames.device)
     cells = batch * rows * width
     step = count if is_gpu(frames.device) else max(1, min(count, CHUNK // cells))
@@ -157,16 +156,12 @@ def _looked(
         part = slice(start, start + step)
         place = velocity * times[0, part]
         place += acceleration * times[1, part]
-        if camera is None:
-            if kept is not None:
-                found[2].append(kept(place))
-            place += first
-        else:
-            place += first
+        place += first
+        if camera is not None:
             place = _led(camera[:, part] / scale, place)
-            if kept is not None:
-                found[2].append(kept(place))
-        found[1].append(_within(place[:, :, 0], last[1], beyond).mul_(_within(place[:, :, 1], last[0], beyond)))
+        if kept is not None:
+            found[2].append(kept(_inside(place, last)))
+        found[1].append(_within(place[:, :, 0], last[1]).mul_(_within(place[:, :, 1], last[0])))
         grid = place.mul_(unit).sub_(1).flatten(0, 1).permute(0, 2, 3, 1)
         images = frames[:, part].reshape(-1, 1, height, width)
         seen = functional.grid_sample(images, grid, mode=mode, padding_mode="border", align_corners=True)
@@ -213,12 +208,18 @@ def _lattice(height: int, width: int, rows: int, device: torch.device) -> tuple[
     return places, unit.to(device)
 
 
-def _within(place: Tensor, last: int, beyond: float) -> Tensor:
-    """Return 1 where a place lies from 0 to `last`, or as little `beyond`, else 0.
+def _within(place: Tensor, last: int) -> Tensor:
+    """Return 1 where a place lies within half a cell of 0 to `last`, else 0.
 
     Floats: a truth value takes five times as long.
     """
-    return place.clamp(-beyond, last + beyond).eq_(place)
+    return place.clamp(-0.5, last + 0.5).eq_(place)
+
+
+def _inside(place: Tensor, last: Sequence[int]) -> Tensor:
+    """Return places [B, K, 2, h, w] = (right, down) that are moved to the last cells where they lie beyond them."""
+    right, down = place.unbind(2)
+    return torch.stack([right.clamp(0, last[1]), down.clamp(0, last[0])], dim=2)
 
 
 def halved(image: Tensor) -> Tensor:
