@@ -196,7 +196,7 @@ def draw(kind: str, split: str, args: argparse.Namespace, size: Size, folder: Pa
 def still(pyramid: Any, offsets: Any, codes: Tensor, deviation: Tensor) -> Moves:
     """Return that nothing moves: `quiver.baselines.paths.motion_paths.moves` otherwise."""
     nothing = torch.zeros(len(codes), 2, *(2 * side for side in codes.shape[2:]))
-    return Moves((nothing, nothing), nothing[:, :1], torch.zeros(*codes.shape[:2], 2, 3))
+    return Moves((nothing, nothing), torch.zeros(*codes.shape[:2], 2, 3))
 
 
 def kept(window: dict[str, Any]) -> dict[str, Array]:

@@ -113,8 +113,7 @@ def merges(clip: Clip, codes: Array, tables: DomainTables) -> dict[str, Merged]:
     frames = torch.from_numpy(codes[MIDDLE - REACH : MIDDLE + REACH + 1])[None]
     window = path_merge.evened(path_merge.prepared(frames, tables), offsets, tables)
     shape = window.codes.shape
-    resting = torch.zeros(1, 1, *shape[-2:])
-    still = Moves((torch.zeros(1, 2, *shape[-2:]),) * 2, resting, torch.zeros(1, len(offsets), 2, 3))
+    still = Moves((torch.zeros(1, 2, *shape[-2:]),) * 2, torch.zeros(1, len(offsets), 2, 3))
     true = followed(window, offsets, true_moves(clip, MIDDLE, REACH))
     return {
         "none": path_merge.merge_along(window, offsets, tables, still),

@@ -9,7 +9,7 @@ nearby: 1 where the scene is the same. The first finds large areas at little lig
 a path misses by a pixel. The worse one decides. A frame that a path leads out of the picture has no weight.
 
 At the ends of a stream the window is moved, not cut: the first frame has ten of its future. Those farther away than
-half of the window count where a place rests or moves as the camera does. One acceleration does not lead farther.
+half of the window count where a place rests. One acceleration does not lead farther.
 
 The count of a pixel is the number of codes whose mean has its noise: (sum of weights)^2 over the sum of squared weights
 times the share of the noise that is left where a moved frame is sampled between its pixels.
@@ -40,7 +40,7 @@ from qsim.sensor.sensor import Sensor
 from quiver.baselines.domain_tables import DomainTables, domain_tables
 from quiver.baselines.information_domain import InformationDomain, information_domain
 from quiver.baselines.paths.light_factors import light_factors
-from quiver.baselines.paths.motion_paths import Moves, moves, none_of
+from quiver.baselines.paths.motion_paths import Moves, moves, none_of, rests
 from quiver.baselines.paths.moved_frames import CHUNK, SCALES, box_mean, enlarged, halved, look_sharply
 from quiver.baselines.sliding_window import check_window, checked_codes, equal_windows, in_units, moved_window
 from quiver.device import is_gpu
@@ -58,7 +58,7 @@ LINEAR = 0.5  # of the largest mean code, up to which codes follow light and are
 FLAT = 0.8  # of it, from which they are left as they are: near saturation they hardly follow light
 MOST_SHARE = 2.0  # of a frame in brighter light than the reference; saturated codes would seem to tell everything
 LEAST_NOISE = 0.1  # of a group of frames; a cubic leaves a frame half of its noise
-LED = 5  # frames to which a path of a place's own leads, or half of a longer window
+NEARBY = 5  # frames from the reference within which motion is found, or half of a longer window
 NEAR = 2  # groups of one frame beside the reference; the other frames are compared with the mean of these three
 
 
@@ -135,7 +135,29 @@ def merge(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Mer
     # The noise that the search for paths expects, from the window without motion: only its size matters there.
     variance = tables.variance(box_mean(pooled.mean(1), 2))[:, None]
     deviation = (variance if window.shares is None else variance * _about_mean(window.shares)).sqrt()
-    return merge_along(window, offsets, tables, moves(window.pyramid, offsets, pooled, deviation))
+    return merge_along(window, offsets, tables, _found(window, offsets, pooled, deviation))
+
+
+def _found(window: Prepared, offsets: Sequence[int], codes: Tensor, deviation: Tensor) -> Moves:
+    """Return how every place moves, by the frames that are near; arguments as of `moves`.
+
+    Frames beyond count where near frames and all frames find no motion: at little light, a few do not see all.
+    """
+    near = [i for i, offset in enumerate(offsets) if abs(offset) <= _reach(offsets)]
+    of_all = moves(window.pyramid, offsets, codes, deviation)
+    if len(near) == len(offsets):
+        return of_all
+    pyramid = {scale: frames[:, near] for scale, frames in window.pyramid.items()}
+    deviation = deviation[:, near] if deviation.shape[1] > 1 else deviation
+    found = moves(pyramid, [offsets[i] for i in near], codes[:, near], deviation)
+    shake = found.shake.new_zeros(len(codes), len(offsets), 2, 3)
+    shake[:, near] = found.shake
+    return Moves(found.path, shake, rests(found) * rests(of_all))
+
+
+def _reach(offsets: Sequence[int]) -> int:
+    """Return how many frames from the reference motion is looked for and followed."""
+    return max(NEARBY, len(offsets) // 2)
 
 
 def _about_mean(shares: Tensor) -> Tensor:
@@ -171,16 +193,15 @@ def evened(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Pr
 def merge_along(window: Prepared, offsets: Sequence[int], tables: DomainTables, found: Moves) -> Merged:
     """Return the reference frames of windows [B, K, H, W], merged along motions that are known."""
 
-    reach = max(LED, len(offsets) // 2)
-    with_camera = 1 - found.own[:, 0]
+    reach = _reach(offsets)
 
     def follow(places: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         frames = torch.stack([window.codes[:, i] for i in places], dim=1)
         times = [offsets[i] for i in places]
         seen, inside, kept = look_sharply(frames, found.path, times, window.size, found.shake[:, places])
         for n, offset in enumerate(times):
-            if abs(offset) > reach:
-                inside[:, n] *= with_camera
+            if found.far is not None and abs(offset) > reach:
+                inside[:, n] *= found.far
         return seen, inside, kept
 
     return merge_followed(window, offsets, tables, follow)

@@ -466,7 +466,12 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
         pyramid = {scale: torch.stack([frame.pyramid[scale] for frame in window]) for scale in SCALES}
         codes = torch.stack([functional.avg_pool2d(frame.codes[None], SCALES[-1])[0] for frame in window])
         deviation = variance_of(box_mean(codes.mean(0)[None], 2)[0], domain).sqrt()
-        velocity, acceleration = paths(pyramid, offsets, codes, deviation)
+        reach = max(5, len(window) // 2)
+        voting = [i for i, offset in enumerate(offsets) if abs(offset) <= reach]
+        seen = {scale: frames[voting] for scale, frames in pyramid.items()}
+        velocity, acceleration = paths(seen, [offsets[i] for i in voting], codes[voting], deviation)
+        both = (velocity, acceleration, *paths(pyramid, offsets, codes, deviation))
+        resting = torch.stack([(field == 0).all(0) for field in both]).all(0)
         moved = torch.empty(len(window), *window[0].codes.shape)
         inside = torch.ones_like(moved)
         kept = torch.ones_like(moved)
@@ -474,8 +479,8 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
             if offset:
                 moves = displacement(velocity, acceleration, offset)
                 moved[i], inside[i] = look(frame.codes, moves, frame.size, "bicubic")
-                if abs(offset) > max(5, len(window) // 2):
-                    inside[i] *= (velocity == 0).all(0) & (acceleration == 0).all(0)
+                if abs(offset) > reach:
+                    inside[i] *= resting
                 kept[i] = kept_noise_of_cubic(in_picture(moves, frame.size))
             else:
                 moved[i] = frame.codes

@@ -74,8 +74,8 @@ class Moves:
     """Where every place of a frame goes: along its path, and from there as the camera shakes."""
 
     path: Path  # [B, 2, H, W] of the full frame
-    own: Tensor  # [B, 1, H, W], 1 where that is a path of the place's own, 0 where it rests or moves as the camera does
     shake: Tensor  # [B, K, 2, 3], of camera_motion.py, what no path follows; zero for windows without it
+    far: Tensor | None = None  # [B, H, W], 1 where frames count that are too far for a path; None: there are none
 
 
 def moves(pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, deviation: Tensor) -> Moves:
@@ -94,17 +94,24 @@ def moves(pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, dev
     whole = _spread(*seen_with_noise(codes, camera, fine), unit)
     pans = agrees(rest - whole, told(mean, camera), PANS)
     if none_of(pans):
-        return Moves(*paths(pyramid, offsets, codes, deviation, still=rest), torch.zeros_like(shake))
+        return Moves(paths(pyramid, offsets, codes, deviation, still=rest), torch.zeros_like(shake))
     steady = _spread(*seen_with_noise(codes, camera - shake, fine), unit)
     shakes = (pans & agrees(steady - whole, told(mean, shake)))[:, None, None, None]
     smooth = torch.where(pans[:, None, None, None], smooth, 0.0)
     if none_of(shakes):
         still = torch.where(pans[:, None, None], steady, rest)
-        return Moves(*paths(pyramid, offsets, codes, deviation, smooth, still), torch.zeros_like(shake))
+        return Moves(paths(pyramid, offsets, codes, deviation, smooth, still), torch.zeros_like(shake))
     shake = torch.where(shakes, shake, 0.0)
     without = {scale: torch.where(shakes, seen_without(x, shake, scale)[0], x) for scale, x in pyramid.items()}
     codes = torch.where(shakes, seen_without(codes, shake, fine)[0], codes)
-    return Moves(*paths(without, offsets, codes, deviation, smooth), shake)
+    return Moves(paths(without, offsets, codes, deviation, smooth), shake)
+
+
+def rests(found: Moves) -> Tensor:
+    """Return 1 where a place neither moves nor is moved by its camera, else 0, [B, H, W]."""
+    velocity, acceleration = found.path
+    moved = velocity.abs().sum(1) + acceleration.abs().sum(1) + found.shake.abs().sum((1, 2, 3))[:, None, None]
+    return (moved == 0).to(velocity.dtype)
 
 
 def none_of(found: Tensor) -> bool:
@@ -151,9 +158,8 @@ def paths(
     deviation: Tensor,
     smooth: Tensor | None = None,
     still: Tensor | None = None,
-) -> tuple[Path, Tensor]:
-    """Return velocity and acceleration [B, 2, H, W] of frames at each scale: {scale: [B, K, H/scale, W/scale]}, and 1
-    where a place has a path of its own, else 0, [B, 1, H, W].
+) -> Path:
+    """Return velocity and acceleration [B, 2, H, W] of frames at each scale: {scale: [B, K, H/scale, W/scale]}.
 
     `offsets` are the frames' places in time; 0 is the reference. The noise of a frame at a scale has the deviation
     1 / scale, as phi of pooled codes nearly has. Mean `codes` [B, K, H/2, W/2] of scale 2 and the `deviation` of one
@@ -175,10 +181,10 @@ def paths(
     full = [SCALES[-1] * side for side in codes.shape[-2:]]
     taken = functional.interpolate(taken[:, None].to(velocity.dtype), size=full)
     if smooth is None:
-        return (enlarged(velocity, full) * taken, enlarged(acceleration, full) * taken), taken
+        return enlarged(velocity, full) * taken, enlarged(acceleration, full) * taken
     pan = field(smooth, *full)
     velocity, acceleration = (torch.lerp(pan[:, n], enlarged(x, full), taken) for n, x in enumerate(found))
-    return (velocity, acceleration), taken
+    return velocity, acceleration
 
 
 def _better(frames: Tensor, offsets: Sequence[int], found: Path) -> Path:

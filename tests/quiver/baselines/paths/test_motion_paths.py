@@ -149,7 +149,7 @@ def window(velocity, acceleration, noise, seed, offsets=range(-5, 6), side=96):
 def found_paths(pyramid, offsets):
     """The velocity and acceleration [2, H, W] of one window."""
     windows = {scale: frames[None] for scale, frames in pyramid.items()}
-    (velocity, acceleration), _ = mp.paths(windows, offsets, windows[2], torch.ones(1, 1, *pyramid[2].shape[1:]))
+    velocity, acceleration = mp.paths(windows, offsets, windows[2], torch.ones(1, 1, *pyramid[2].shape[1:]))
     return velocity[0], acceleration[0]
 
 
