@@ -184,7 +184,7 @@ def misfits_of(frames: Tensor, offsets: Sequence[int], path: Path, scale: int, r
     for frame, offset in voters:
         moved = displacement(*path, offset, scale)
         seen, there = look(frame, moved)
-        misfits += misfit((seen - reference) * scale, 1 + kept_noise(moved)) * there
+        misfits += misfit((seen - reference) * scale, 1 + kept_noise(in_picture(moved))) * there
         inside += there
     return _cost(misfits, inside, len(voters), (radius,))[0]
 
