@@ -152,7 +152,10 @@ def _found(window: Prepared, offsets: Sequence[int], codes: Tensor, deviation: T
     found = moves(pyramid, [offsets[i] for i in near], codes[:, near], deviation)
     shake = found.shake.new_zeros(len(codes), len(offsets), 2, 3)
     shake[:, near] = found.shake
-    return Moves(found.path, shake, rests(found) * rests(of_all))
+    far = rests(found) * rests(of_all)
+    if window.shares is not None:
+        far = torch.zeros_like(far)  # light that changes hides what moves
+    return Moves(found.path, shake, far)
 
 
 def _reach(offsets: Sequence[int]) -> int:
