@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from math import log
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -46,26 +47,39 @@ class Response:
     top: int  # the largest code of the sensor
     sensor: str  # its parameters, for messages
 
-    def cap(self, samples: int) -> float:
+    def highest(self, samples: Any) -> Any:
+        """Return the mean code to which estimates from `samples` codes go at most: half a count below saturation.
+
+        `samples` may be an array of any library.
+        """
+        return float(self.mean[-1]) - 0.5 / samples
+
+    @property
+    def fewest(self) -> float:
+        """Number of codes whose mean resolves half of the response."""
+        return float(1 / (self.mean[-1] - self.mean[0]))
+
+    def cap(self, samples: float) -> float:
         """Return the largest estimate [photons] from the mean of `samples` codes: half a count below saturation.
 
         `ValueError` if the mean of this many codes does not resolve the response at all.
         """
-        if self.mean[-1] - 0.5 / samples <= self.mean[0]:
+        highest = self.highest(samples)
+        if highest <= self.mean[0]:
             raise ValueError(
                 f"{self.sensor}: its mean code rises from {self.mean[0]:.4g} in the dark to {self.mean[-1]:.4g} at "
                 f"{self.photons[-1]:.4g} photons, which the mean of {samples} codes does not resolve; use a longer "
                 "window, or the method naive"
             )
-        return float(np.interp(self.mean[-1] - 0.5 / samples, self.mean, self.photons))
+        return float(np.interp(highest, self.mean, self.photons))
 
-    def invert(self, mean_code: Array, samples: int) -> Array:
+    def invert(self, mean_code: Array, samples: float | Array) -> Array:
         """Return photons [...] whose mean code is this: 0 below the mean of a dark pixel, cap(samples) at saturation.
 
-        `ValueError` as for `cap`.
+        `samples` may differ from pixel to pixel. `ValueError` as for `cap`, of the fewest of them.
         """
-        self.cap(samples)
-        return np.interp(np.minimum(mean_code, self.mean[-1] - 0.5 / samples), self.mean, self.photons)
+        self.cap(float(np.min(samples)))
+        return np.interp(np.minimum(mean_code, self.highest(samples)), self.mean, self.photons)
 
 
 @dataclass(frozen=True)

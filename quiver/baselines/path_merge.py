@@ -9,7 +9,8 @@ nearby: 1 where the scene is the same. The first finds large areas at little lig
 a path misses by a pixel. The worse one decides. A frame that a path leads out of the picture has no weight.
 
 At the ends of a stream the window is moved, not cut: the first frame has ten of its future. Those farther away than
-half of the window count where a place rests. One acceleration does not lead farther.
+half of the window count where a place rests, and where all around it they have the mean of near frames: motion that
+nothing finds shows there. One acceleration does not lead farther.
 
 The count of a pixel is the number of codes whose mean has its noise: (sum of weights)^2 over the sum of squared weights
 times the share of the noise that is left where a moved frame is sampled between its pixels.
@@ -59,6 +60,9 @@ FLAT = 0.8  # of it, from which they are left as they are: near saturation they 
 MOST_SHARE = 2.0  # of a frame in brighter light than the reference; saturated codes would seem to tell everything
 LEAST_NOISE = 0.1  # of a group of frames; a cubic leaves a frame half of its noise
 NEARBY = 5  # frames from the reference within which motion is found, or half of a longer window
+# (cells of 2 x 2 px along the side of a block, blocks beside the own one over which squares are averaged; deviations of
+# their mean up to which far frames have the mean of near ones)
+UNCHANGED = ((1, 16, 4.0), (4, 4, 3.5))
 NEAR = 2  # groups of one frame beside the reference; the other frames are compared with the mean of these three
 
 
@@ -68,6 +72,7 @@ class Merged:
 
     mean_code: Tensor
     count: Tensor
+    weight: Tensor  # sum of the weights of frames, 1 of the reference included
     alone: Tensor  # codes of the frame
     near: Tensor  # mean code of the frame and its two neighbours, moved and weighted
     near_count: Tensor
@@ -131,31 +136,65 @@ def _windows(images: Sequence[Tensor], count: int) -> Tensor:
 def merge(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Merged:
     """Return the merged reference frames of windows [B, K, H, W]; `offsets` are the frames' places in time, with 0."""
     window = evened(window, offsets, tables)
-    pooled = halved(window.codes)
-    # The noise that the search for paths expects, from the window without motion: only its size matters there.
-    variance = tables.variance(box_mean(pooled.mean(1), 2))[:, None]
-    deviation = (variance if window.shares is None else variance * _about_mean(window.shares)).sqrt()
-    return merge_along(window, offsets, tables, _found(window, offsets, pooled, deviation))
+    return merge_along(window, offsets, tables, _found(window, offsets, tables))
 
 
-def _found(window: Prepared, offsets: Sequence[int], codes: Tensor, deviation: Tensor) -> Moves:
-    """Return how every place moves, by the frames that are near; arguments as of `moves`.
+def _found(window: Prepared, offsets: Sequence[int], tables: DomainTables) -> Moves:
+    """Return how every place of windows [B, K, H, W] moves, by the frames that are near.
 
     Frames beyond count where near frames and all frames find no motion: at little light, a few do not see all.
     """
+    codes = halved(window.codes)
     near = [i for i, offset in enumerate(offsets) if abs(offset) <= _reach(offsets)]
-    of_all = moves(window.pyramid, offsets, codes, deviation)
+    found = _moves_of(window, offsets, codes, near, tables)
     if len(near) == len(offsets):
-        return of_all
-    pyramid = {scale: frames[:, near] for scale, frames in window.pyramid.items()}
-    deviation = deviation[:, near] if deviation.shape[1] > 1 else deviation
-    found = moves(pyramid, [offsets[i] for i in near], codes[:, near], deviation)
+        return found
     shake = found.shake.new_zeros(len(codes), len(offsets), 2, 3)
     shake[:, near] = found.shake
-    far = rests(found) * rests(of_all)
-    if window.shares is not None:
-        far = torch.zeros_like(far)  # light that changes hides what moves
+    if window.shares is None:
+        of_all = _moves_of(window, offsets, codes, range(len(offsets)), tables)
+        far = rests(found) * rests(of_all) * unchanged(codes, near, tables)
+    else:
+        far = torch.zeros_like(window.codes[:, 0])  # light that changes hides what moves
     return Moves(found.path, shake, far)
+
+
+def _moves_of(
+    window: Prepared, offsets: Sequence[int], codes: Tensor, places: Sequence[int], tables: DomainTables
+) -> Moves:
+    """Return how every place moves, by the frames at some places of the windows; `codes` as of `moves`, of all."""
+    # The noise that the search for paths expects, from the frames without motion: only its size matters there.
+    seen = codes[:, places]
+    variance = tables.variance(box_mean(seen.mean(1), 2))[:, None]
+    if window.shares is not None:
+        variance = variance * _about_mean(window.shares[:, places])
+    pyramid = {scale: frames[:, places] for scale, frames in window.pyramid.items()}
+    return moves(pyramid, [offsets[i] for i in places], seen, variance.sqrt())
+
+
+def unchanged(codes: Tensor, near: Sequence[int], tables: DomainTables) -> Tensor:
+    """Return 1 where the other frames have the mean of those `near`, all around, else 0: [B, H, W] of mean codes of
+    2 x 2 px [B, K, H/2, W/2].
+
+    Motion that is too dim to be found is seen here, as an area is larger than the blocks that vote on a path.
+    """
+    frames = codes.shape[1]
+    total = codes.sum(1)
+    nearer = codes[:, near].sum(1)
+    others = frames - len(near)
+    variance = tables.variance(box_mean(total / frames, 1)) * (1 / others + 1 / len(near)) / 4
+    difference = (total - nearer) / others - nearer / len(near)
+    same = torch.ones_like(difference)
+    for side, beside, most in UNCHANGED:
+        blocks = functional.avg_pool2d(difference, side)
+        squares = blocks.square_().mul_(side**2 / functional.avg_pool2d(variance, side))
+        around = 2 * beside + 1
+        counted = functional.avg_pool2d(torch.ones_like(squares), around, 1, beside).mul_(around**2)
+        mean = functional.avg_pool2d(squares, around, 1, beside, count_include_pad=False)
+        # A square of noise has the mean 1 and the variance 2.
+        fits = (mean < 1 + most * (2 / counted).sqrt()).to(same.dtype)
+        same *= functional.interpolate(fits[:, None], size=same.shape[-2:])[:, 0]
+    return functional.interpolate(same[:, None], scale_factor=2.0)[:, 0]
 
 
 def _reach(offsets: Sequence[int]) -> int:
@@ -222,6 +261,7 @@ def merge_followed(window: Prepared, offsets: Sequence[int], tables: DomainTable
     return Merged(
         mean_code,
         _count(total, weights, groups.noise),
+        total,
         alone,
         near_mean,
         _count(near_total, weights[:, :NEAR], groups.noise[:, :NEAR]),
@@ -378,5 +418,7 @@ def restore(
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     height, width = codes.shape[1:]
     for i, merged in enumerate(stream(lambda t: codes[t], len(codes), domain, window, frames)):
-        restored[i] = table.invert(merged.mean_code[0, :height, :width].numpy(), merged.frames)
+        table.cap(merged.frames)
+        mean_code, weight = (x[0, :height, :width].numpy() for x in (merged.mean_code, merged.weight))
+        restored[i] = table.invert(mean_code, np.maximum(weight, table.fewest))
     return in_units(restored, photons_per_unit)

@@ -465,13 +465,14 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
     with torch.no_grad():
         pyramid = {scale: torch.stack([frame.pyramid[scale] for frame in window]) for scale in SCALES}
         codes = torch.stack([functional.avg_pool2d(frame.codes[None], SCALES[-1])[0] for frame in window])
-        deviation = variance_of(box_mean(codes.mean(0)[None], 2)[0], domain).sqrt()
         reach = max(5, len(window) // 2)
         voting = [i for i, offset in enumerate(offsets) if abs(offset) <= reach]
         seen = {scale: frames[voting] for scale, frames in pyramid.items()}
-        velocity, acceleration = paths(seen, [offsets[i] for i in voting], codes[voting], deviation)
-        both = (velocity, acceleration, *paths(pyramid, offsets, codes, deviation))
+        near_offsets = [offsets[i] for i in voting]
+        velocity, acceleration = paths(seen, near_offsets, codes[voting], deviation_of(codes[voting], domain))
+        both = (velocity, acceleration, *paths(pyramid, offsets, codes, deviation_of(codes, domain)))
         resting = torch.stack([(field == 0).all(0) for field in both]).all(0)
+        resting &= torch.from_numpy(unchanged(codes, voting, domain))
         moved = torch.empty(len(window), *window[0].codes.shape)
         inside = torch.ones_like(moved)
         kept = torch.ones_like(moved)
@@ -501,6 +502,33 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
             groups=(sums / counts.clamp(min=1)).numpy(),
             group_counts=torch.where(counts > 0, counts.square() / noise, 0.0).numpy(),
         )
+
+
+def deviation_of(codes: Tensor, domain: InformationDomain) -> Tensor:
+    """Return the deviation of a code [h, w] of frames [K, h, w] that stand still."""
+    return variance_of(box_mean(codes.mean(0)[None], 2)[0], domain).sqrt()
+
+
+def unchanged(codes: Tensor, near: Sequence[int], domain: InformationDomain) -> Array:
+    """Return where the mean of the other frames is that of those `near`, all around: bool [2 h, 2 w] of codes
+    [K, h, w].
+    """
+    far = [i for i in range(len(codes)) if i not in near]
+    if not far:
+        return np.ones([2 * side for side in codes.shape[1:]], bool)
+    difference = (codes[far].mean(0) - codes[near].mean(0)).numpy()
+    variance = variance_of(box_mean(codes.mean(0)[None], 1)[0], domain).numpy() * (1 / len(far) + 1 / len(near)) / 4
+    same = np.ones(difference.shape, bool)
+    for side, beside, most in ((1, 16, 4.0), (4, 4, 3.5)):
+        rows, columns = (length // side for length in difference.shape)
+        blocks, noise = (x.reshape(rows, side, columns, side).mean((1, 3)) for x in (difference, variance / side**2))
+        squares = blocks**2 / noise
+        for y in range(rows):
+            for x in range(columns):
+                around = squares[max(0, y - beside) : y + beside + 1, max(0, x - beside) : x + beside + 1]
+                if around.mean() >= 1 + most * np.sqrt(2 / around.size):
+                    same[y * side : (y + 1) * side, x * side : (x + 1) * side] = False
+    return same.repeat(2, 0).repeat(2, 1)
 
 
 def variance_of(mean_code: Tensor, domain: InformationDomain) -> Tensor:

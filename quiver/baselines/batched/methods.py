@@ -154,8 +154,8 @@ def _qbp(
         merged = batched_qbp.merge(seen, range(start, start + window), sensor, exposure, settings)
         place = slice(part.start - frames.start, part.stop - frames.start)
         if excess is None:
-            inverse, most = tables.light(sensor, exposure, count, codes.device)
-            found[place] = inverse(merged.to(torch.float64).clamp(max=most))
+            sensor.response(exposure).cap(count)
+            found[place] = tables.light(sensor, exposure, codes.device)(merged, count)
             continue
         transform = tables.stabiliser(sensor, exposure, (1,) * count, "table", codes.device)
         stable = transform.forward(merged)
@@ -169,14 +169,16 @@ def _path_merge(codes: Tensor, sensor: Sensor, exposure: float, window: int, fra
     length, height, width = codes.shape
     found = codes.new_empty((len(frames), height, width), dtype=torch.float32)
     domain = information_domain(sensor, exposure)
+    light = tables.light(sensor, exposure, codes.device)
     together = _together(memory, path_merge.PIXEL_BYTES, codes)
     first = 0
     for merged in path_merge.stream(
         lambda t: codes[t], length, domain, window, frames, codes.device, together=together
     ):
-        inverse, most = tables.light(sensor, exposure, merged.frames, codes.device)
-        mean_code = merged.mean_code[:, :height, :width].to(torch.float64)
-        found[first : first + len(mean_code)] = inverse(mean_code.clamp(max=most))
+        light.response.cap(merged.frames)
+        mean_code, weight = (x[:, :height, :width] for x in (merged.mean_code, merged.weight))
+        samples = weight.to(torch.float64).clamp(min=light.response.fewest)
+        found[first : first + len(mean_code)] = light(mean_code, samples)
         first += len(mean_code)
     return found
 

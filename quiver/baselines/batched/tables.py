@@ -12,6 +12,7 @@ import torch
 from numpy import ndarray as Array
 from torch import Tensor
 
+from qsim.sensor.estimation import Response
 from qsim.sensor.sensor import Sensor
 from quiver.baselines import vst
 
@@ -45,12 +46,23 @@ def variance_of_code(sensor: Sensor, exposure: float, device: torch.device) -> T
     return table(response.mean, response.variance, device)
 
 
+@dataclass(frozen=True, eq=False)
+class Light:
+    """The photons over the mean code of a sensor."""
+
+    photons: Table
+    response: Response
+
+    def __call__(self, mean_code: Tensor, samples: float | Tensor) -> Tensor:
+        """Return the photons, float32 [...], of the mean [...] of so many codes; see `Response.invert`."""
+        return self.photons(mean_code.to(torch.float64).clamp(max=self.response.highest(samples)))
+
+
 @lru_cache(maxsize=32)
-def light(sensor: Sensor, exposure: float, samples: int, device: torch.device) -> tuple[Table, float]:
-    """Return the photons over the mean of so many codes, and the mean code to which estimates go at most."""
+def light(sensor: Sensor, exposure: float, device: torch.device) -> Light:
+    """Return the photons over the mean code of a sensor, on a device."""
     response = sensor.response(exposure)
-    response.cap(samples)
-    return table(response.mean, response.photons, device), float(response.mean[-1] - 0.5 / samples)
+    return Light(table(response.mean, response.photons, device), response)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from quiver.baselines import path_merge as pm
 from quiver.baselines.domain_tables import domain_tables
 from quiver.baselines.information_domain import FLOOR, information_domain
 from quiver.baselines.paths.motion_paths import Moves
+from quiver.baselines.sliding_window import existing_frames, moved_window
 
 EXPOSURE = 5e-4
 SENSOR = QIS(0.8, 1.6, 0.2, 3)
@@ -299,6 +300,52 @@ def test_far_frames_count_where_a_place_rests(monkeypatch):
     count = merged(codes, 0).count
     assert count[:, :20].mean() > 9
     assert count[:, 28:].mean() < 6.001
+
+
+def restored_by(codes, sensor, t, window, monkeypatch):
+    """Frame t of codes, merged with the frames of a window."""
+    monkeypatch.setattr(pm, "moved_window", window)
+    return pm.restore(codes, sensor, EXPOSURE, frames=range(t, t + 1))[0]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_motion_that_nothing_finds_takes_no_far_frames(seed, monkeypatch):
+    """Smooth blobs and fine textures at little light, moved as a whole. They had lost up to 1.4 dB."""
+    rng = np.random.default_rng([seed, 55])
+    picture = gaussian_filter(rng.normal(size=(192, 192)), rng.choice([1.0, 2.0, 4.0, 8.0]), mode="wrap")
+    picture = np.exp(0.5 * picture / picture.std())
+    step = rng.choice([-8, -4, 4, 8], 2)
+    light = np.stack([np.roll(picture, t * step, axis=(0, 1))[:112, :128] for t in range(14)])
+    sensor, photons = ((SENSOR, 0.5), (BinarySPAD(1.0, 0.0, 1), 1.0), (BinarySPAD(1.0, 0.0, 1), 0.4))[seed % 3]
+    light *= photons / light.mean()
+    codes = sensor.sample(light, EXPOSURE, key=Key(seed, 6))
+    for t in (0, 2, 13):
+        cut, moved = (
+            np.square(restored_by(codes, sensor, t, window, monkeypatch) - light[t]).mean()
+            for window in (existing_frames, moved_window)
+        )
+        assert moved < 1.02 * cut
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_far_frames_of_a_still_stream_have_the_mean_of_near_ones(seed):
+    """Over sensors, light and textures, up to the corners."""
+    rng = np.random.default_rng([seed, 56])
+    sensor = (SENSOR, BinarySPAD(1.0, 0.0, 1), QIS(0.8, 1.6, 0.2, 7))[seed % 3]
+    photons = 10 ** rng.uniform(-0.5, 1)
+    light = photons * np.exp(0.5 * rng.normal(size=(96, 128)))
+    codes = torch.from_numpy(sensor.sample(np.broadcast_to(light, (11, 96, 128)), EXPOSURE, key=Key(seed, 7)))
+    tables = domain_tables(information_domain(sensor, EXPOSURE), torch.device("cpu"))
+    same = pm.unchanged(pm.halved(codes[None].float()), range(6), tables)
+    assert same.shape == (1, 96, 128)
+    assert same.mean() > 0.8
+
+
+def test_no_far_frame_counts_while_light_changes():
+    light = gaussian_filter(np.random.default_rng(8).uniform(0, 12, (64, 72)), 2)
+    fading = np.linspace(1, 0.4, 14)[:, None, None] * light
+    codes = SENSOR.sample(fading, EXPOSURE, key=Key(8, 0))
+    assert merged(codes, 0).count.max() <= 6.001
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -31,7 +31,7 @@ def mean_of(codes):
     groups = np.stack([codes[[5 + offset for offset in group]].mean(0, dtype=np.float32) for group in GROUPS])
     tensors = [torch.from_numpy(x)[None] for x in (mean, count, codes[5].astype(np.float32), groups, counts)]
     mean, count, alone, groups, counts = tensors
-    return Merged(mean, count, alone, mean, count, mean, len(codes), groups, counts)
+    return Merged(mean, count, count, alone, mean, count, mean, len(codes), groups, counts)
 
 
 @pytest.mark.parametrize(
