@@ -1,9 +1,7 @@
 """Updates the weights: by Adam alone, or by Muon for the inner kernels and Adam for all other weights.
 
-Muon (Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks"; torch.optim.Muon) replaces the
-momentum of a kernel, as a matrix [out, in * h * w], by its polar factor. All directions of the matrix then change at
-the same rate. Its steps are scaled to the size of Adam's (Liu et al. 2025, "Muon is scalable for LLM training"), so
-that both use one learning rate.
+Muon (muon.py) sees a kernel as a matrix [out, in * h * w]. Its steps have the size of Adam's, so that both use one
+learning rate.
 """
 
 from __future__ import annotations
@@ -12,6 +10,8 @@ from typing import Any, Literal
 
 import torch
 from torch import nn
+
+from quiver.training.muon import Muon
 
 Kind = Literal["adam", "muon"]
 OPTIMISERS: tuple[Kind, ...] = ("adam", "muon")
@@ -22,7 +22,7 @@ EDGES = ("leave",)  # names of last layers, which Adam updates
 class Optimiser:
     """Adam, or Muon and Adam, for the weights of a network, which must already be on their device.
 
-    `ValueError` if the kind is Muon and a kernel is not contiguous, or torch is older than Muon.
+    `ValueError` if the kind is Muon and a kernel is not contiguous.
     """
 
     def __init__(self, model: nn.Module, kind: Kind, rate: float, betas: tuple[float, float]) -> None:
@@ -37,10 +37,7 @@ class Optimiser:
         rest = [weight for _, weight in named if not any(weight is kernel for kernel in self.kernels)]
         self.parts: list[torch.optim.Optimizer] = [torch.optim.Adam(rest, lr=rate, betas=betas, eps=1e-8)]
         if self.matrices:
-            if not hasattr(torch.optim, "Muon"):
-                raise ValueError(f"Muon needs torch 2.9 or newer, this is {torch.__version__}; choose optimiser=adam")
-            muon = torch.optim.Muon(self.matrices, lr=rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
-            self.parts.append(muon)
+            self.parts.append(Muon(self.matrices, rate))
 
     def step(self, rate: float) -> None:
         """Update the weights by their gradients; a weight without gradient does not change."""

@@ -129,7 +129,7 @@ def test_a_finished_run_stays_finished(tiny_dataset, tmp_path, end):
     assert (again.history, again.step) == (first.history, first.step)
 
 
-@pytest.mark.parametrize("lack", ["memory", "Muon", "tensorboard"])
+@pytest.mark.parametrize("lack", ["memory", "tensorboard"])
 def test_a_run_is_replaced_only_by_one_that_can_start(tiny_dataset, tmp_path, monkeypatch, lack):
     once = settings(tiny_dataset, tmp_path / "r", steps=1)
     train(small_network(), once, progress=False)
@@ -141,8 +141,6 @@ def test_a_run_is_replaced_only_by_one_that_can_start(tiny_dataset, tmp_path, mo
 
     if lack == "memory":
         monkeypatch.setattr(network, "to", full)
-    elif lack == "Muon":
-        monkeypatch.delattr(torch.optim, "Muon")
     else:
         monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises((MemoryError, ValueError, ModuleNotFoundError)):

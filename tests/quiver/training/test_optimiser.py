@@ -31,13 +31,6 @@ def steps(unet: UNet, kind: str) -> dict[str, torch.Tensor]:
     return {name: weight.detach() - before[name] for name, weight in unet.named_parameters()}
 
 
-def test_a_torch_without_muon_is_told(monkeypatch):
-    monkeypatch.delattr(torch.optim, "Muon")
-    with pytest.raises(ValueError, match=r"Muon needs torch 2\.9 or newer, this is .*; choose optimiser=adam"):
-        Optimiser(network(), "muon", RATE, (0.9, 0.99))
-    Optimiser(network(), "adam", RATE, (0.9, 0.99))
-
-
 def check_first_step_of_adam(unet: UNet, name: str, step: torch.Tensor) -> None:
     """Assert a step of -rate * g / (|g| + 1e-8) for the gradient g.
 
@@ -68,7 +61,7 @@ def test_muon_moves_every_direction_of_a_kernel_alike():
         assert gradient is not None
         u, _, v = torch.linalg.svd(gradient.flatten(1), full_matrices=False)
         strengths = torch.diag(u.T @ -step.flatten(1) @ v.T) / (0.2 * RATE * max(gradient.flatten(1).shape) ** 0.5)
-        # torch's five iterations give 0.7 to 1.2 for singular values above 1/500 of the norm
+        # five iterations give 0.7 to 1.2 for singular values above 1/500 of the norm
         assert 0.6 < strengths.min() <= strengths.max() < 1.25, name
     assert inner > 10
 
