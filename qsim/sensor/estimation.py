@@ -62,13 +62,15 @@ class Response:
     def cap(self, samples: float) -> float:
         """Return the largest estimate [photons] from the mean of `samples` codes: half a count below saturation.
 
-        `ValueError` if the mean of this many codes does not resolve the response at all.
+        `ValueError` unless `samples` is above 0, and if the mean of this many codes does not resolve the response.
         """
+        if not samples > 0:
+            raise ValueError(f"samples is a number of codes above 0, got {samples!r}")
         highest = self.highest(samples)
         if highest <= self.mean[0]:
             raise ValueError(
                 f"{self.sensor}: its mean code rises from {self.mean[0]:.4g} in the dark to {self.mean[-1]:.4g} at "
-                f"{self.photons[-1]:.4g} photons, which the mean of {samples} codes does not resolve; use a longer "
+                f"{self.photons[-1]:.4g} photons, which the mean of {samples:g} codes does not resolve; use a longer "
                 "window, or the method naive"
             )
         return float(np.interp(highest, self.mean, self.photons))
@@ -78,7 +80,9 @@ class Response:
 
         `samples` may differ from pixel to pixel. `ValueError` as for `cap`, of the fewest of them.
         """
-        self.cap(float(np.min(samples)))
+        samples = np.asarray(samples, np.float64)
+        if samples.size:
+            self.cap(float(samples.min()))
         return np.interp(np.minimum(mean_code, self.highest(samples)), self.mean, self.photons)
 
 

@@ -420,5 +420,5 @@ def restore(
     for i, merged in enumerate(stream(lambda t: codes[t], len(codes), domain, window, frames)):
         table.cap(merged.frames)
         mean_code, weight = (x[0, :height, :width].numpy() for x in (merged.mean_code, merged.weight))
-        restored[i] = table.invert(mean_code, np.maximum(weight, table.fewest))
+        restored[i] = table.invert(mean_code, np.clip(weight, table.fewest, max(merged.frames, table.fewest)))
     return in_units(restored, photons_per_unit)

@@ -35,30 +35,28 @@ class Muon(torch.optim.Optimizer):
         super().__init__(matrices, {"lr": rate})
 
     @torch.no_grad()
-    def step(self, closure: Any = None) -> None:
+    def step(self, closure: Any = None) -> None:  # type: ignore[override]
         """Update the matrices that have a gradient. No `closure` is called: `TypeError` for one."""
         if closure is not None:
             raise TypeError("Muon calls no closure; compute the gradients before its step")
         for group in self.param_groups:
-            alike: defaultdict[tuple[torch.Size, torch.device], list[Tensor]] = defaultdict(list)
+            alike: defaultdict[tuple[torch.Size, torch.device], list[tuple[Tensor, Tensor]]] = defaultdict(list)
             for matrix in group["params"]:
                 if matrix.grad is not None:
-                    alike[matrix.shape, matrix.device].append(matrix)
-            for matrices in alike.values():
-                self._move(matrices, group["lr"])
+                    alike[matrix.shape, matrix.device].append((matrix, self._ahead(matrix, matrix.grad)))
+            for (shape, _), found in alike.items():
+                matrices, ahead = zip(*found, strict=True)
+                size = SIZE * max(shape) ** 0.5
+                for matrix, factor in zip(matrices, polar_factors(torch.stack(ahead)), strict=True):
+                    matrix.add_(factor, alpha=-group["lr"] * size)
 
-    def _move(self, matrices: list[Tensor], rate: float) -> None:
-        """Update matrices of one shape."""
-        ahead = []
-        for matrix in matrices:
-            state = self.state[matrix]
-            if not state:
-                state["momentum_buffer"] = torch.zeros_like(matrix)
-            momentum = state["momentum_buffer"].lerp_(matrix.grad, 1 - MOMENTUM)
-            ahead.append(matrix.grad.lerp(momentum, MOMENTUM))
-        size = SIZE * max(matrices[0].shape) ** 0.5
-        for matrix, factor in zip(matrices, polar_factors(torch.stack(ahead)), strict=True):
-            matrix.add_(factor, alpha=-rate * size)
+    def _ahead(self, matrix: Tensor, gradient: Tensor) -> Tensor:
+        """Return a gradient with its momentum, which it changes, as Nesterov looks ahead."""
+        state = self.state[matrix]
+        if not state:
+            state["momentum_buffer"] = torch.zeros_like(matrix)
+        momentum = state["momentum_buffer"].lerp_(gradient, 1 - MOMENTUM)
+        return gradient.lerp(momentum, MOMENTUM)
 
 
 def polar_factors(matrices: Tensor) -> Tensor:

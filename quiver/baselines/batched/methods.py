@@ -177,7 +177,8 @@ def _path_merge(codes: Tensor, sensor: Sensor, exposure: float, window: int, fra
     ):
         light.response.cap(merged.frames)
         mean_code, weight = (x[:, :height, :width] for x in (merged.mean_code, merged.weight))
-        samples = weight.to(torch.float64).clamp(min=light.response.fewest)
+        fewest = light.response.fewest
+        samples = weight.to(torch.float64).clamp(fewest, max(merged.frames, fewest))
         found[first : first + len(mean_code)] = light(mean_code, samples)
         first += len(mean_code)
     return found
