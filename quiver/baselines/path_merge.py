@@ -62,7 +62,7 @@ LEAST_NOISE = 0.1  # of a group of frames; a cubic leaves a frame half of its no
 NEARBY = 5  # frames from the reference within which motion is found, or half of a longer window
 # (cells of 2 x 2 px along the side of a block, blocks beside the own one over which squares are averaged; deviations of
 # their mean up to which far frames have the mean of near ones)
-UNCHANGED = ((1, 16, 4.0), (4, 4, 3.5))
+UNCHANGED = ((1, 16, 3.0), (4, 4, 2.5))
 NEAR = 2  # groups of one frame beside the reference; the other frames are compared with the mean of these three
 
 

@@ -519,7 +519,7 @@ def unchanged(codes: Tensor, near: Sequence[int], domain: InformationDomain) -> 
     difference = (codes[far].mean(0) - codes[near].mean(0)).numpy()
     variance = variance_of(box_mean(codes.mean(0)[None], 1)[0], domain).numpy() * (1 / len(far) + 1 / len(near)) / 4
     same = np.ones(difference.shape, bool)
-    for side, beside, most in ((1, 16, 4.0), (4, 4, 3.5)):
+    for side, beside, most in ((1, 16, 3.0), (4, 4, 2.5)):
         rows, columns = (length // side for length in difference.shape)
         blocks, noise = (x.reshape(rows, side, columns, side).mean((1, 3)) for x in (difference, variance / side**2))
         squares = blocks**2 / noise

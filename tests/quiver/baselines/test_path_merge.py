@@ -324,23 +324,44 @@ def restored_by(codes, sensor, t, window, monkeypatch):
     return pm.restore(codes, sensor, EXPOSURE, frames=range(t, t + 1))[0]
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_motion_that_nothing_finds_takes_no_far_frames(seed, monkeypatch):
-    """Smooth blobs and fine textures at little light, moved as a whole. They had lost up to 1.4 dB."""
+def changed_by(seed, size, steps):
+    """A third of the seeds each: 3 bits at 0.5 photons, 1 bit at 1 and at 0.4. Light [T, H, W] of blobs of `size` px
+    that move by `steps`, its codes and the sensor.
+    """
     rng = np.random.default_rng([seed, 55])
-    picture = gaussian_filter(rng.normal(size=(192, 192)), rng.choice([1.0, 2.0, 4.0, 8.0]), mode="wrap")
+    picture = gaussian_filter(rng.normal(size=(192, 192)), size, mode="wrap")
     picture = np.exp(0.5 * picture / picture.std())
-    step = rng.choice([-8, -4, 4, 8], 2)
-    light = np.stack([np.roll(picture, t * step, axis=(0, 1))[:112, :128] for t in range(14)])
+    light = np.stack([np.roll(picture, t * np.array(steps), axis=(0, 1))[:96, :112] for t in range(14)])
     sensor, photons = ((SENSOR, 0.5), (BinarySPAD(1.0, 0.0, 1), 1.0), (BinarySPAD(1.0, 0.0, 1), 0.4))[seed % 3]
     light *= photons / light.mean()
-    codes = sensor.sample(light, EXPOSURE, key=Key(seed, 6))
+    return light, sensor.sample(light, EXPOSURE, key=Key(seed, 6)), sensor
+
+
+def same_as_near(codes, sensor):
+    """Where the first frame's far frames have the mean of its near ones."""
+    tables = domain_tables(information_domain(sensor, EXPOSURE), torch.device("cpu"))
+    return pm.unchanged(pm.halved(torch.from_numpy(codes[None, :11]).float()), range(6), tables)[0]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_window_that_is_moved_is_no_worse_than_one_that_is_cut(seed, monkeypatch):
+    """Where motion is not found, too. A first frame of one bit had lost 1.3 dB."""
+    size = (1.0, 2.0, 4.0, 8.0)[seed % 4]
+    light, codes, sensor = changed_by(seed, size, (seed % 5 - 2, 1 + seed % 3))
     for t in (0, 2, 13):
-        cut, moved = (
-            np.square(restored_by(codes, sensor, t, window, monkeypatch) - light[t]).mean()
-            for window in (existing_frames, moved_window)
-        )
-        assert moved < 1.02 * cut
+        errors = []
+        for window in (existing_frames, moved_window):
+            monkeypatch.setattr(pm, "moved_window", window)
+            found = pm.restore(codes, sensor, EXPOSURE, frames=range(t, t + 1))[0]
+            errors.append(np.square(found - light[t]).mean())
+        assert errors[1] < 1.02 * errors[0]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_motion_that_nothing_finds_shows_all_around(seed):
+    """Smooth blobs at little light: with their far frames the network was up to 3 dB worse than without."""
+    _, codes, sensor = changed_by(seed, (4.0, 8.0)[seed % 2], ((1, 2), (2, -1), (-2, 2))[seed // 4])
+    assert same_as_near(codes, sensor).mean() < 0.3
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -348,13 +369,11 @@ def test_far_frames_of_a_still_stream_have_the_mean_of_near_ones(seed):
     """Over sensors, light and textures, up to the corners."""
     rng = np.random.default_rng([seed, 56])
     sensor = (SENSOR, BinarySPAD(1.0, 0.0, 1), QIS(0.8, 1.6, 0.2, 7))[seed % 3]
-    photons = 10 ** rng.uniform(-0.5, 1)
-    light = photons * np.exp(0.5 * rng.normal(size=(96, 128)))
-    codes = torch.from_numpy(sensor.sample(np.broadcast_to(light, (11, 96, 128)), EXPOSURE, key=Key(seed, 7)))
-    tables = domain_tables(information_domain(sensor, EXPOSURE), torch.device("cpu"))
-    same = pm.unchanged(pm.halved(codes[None].float()), range(6), tables)
-    assert same.shape == (1, 96, 128)
-    assert same.mean() > 0.8
+    light = 10 ** rng.uniform(-0.5, 1) * np.exp(0.5 * rng.normal(size=(96, 128)))
+    codes = sensor.sample(np.broadcast_to(light, (11, 96, 128)), EXPOSURE, key=Key(seed, 7))
+    same = same_as_near(codes, sensor)
+    assert same.shape == (96, 128)
+    assert same.mean() > 0.7
 
 
 def test_no_far_frame_counts_while_light_changes():
