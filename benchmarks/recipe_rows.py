@@ -1,12 +1,14 @@
 """Trains a small QUIVER in many ways for the same time, and writes one row per way and seed, and a page.
 
     python benchmarks/recipe_rows.py out/starter --speeds                # seconds of a step of each way, in minutes
+    python benchmarks/recipe_rows.py out/starter --speeds --rows long,crop-128   # of ways that came later
     python benchmarks/recipe_rows.py out/starter --rows quick,long       # rows that are missing, for seeds 1 and 2
     python benchmarks/recipe_rows.py out/starter --final long            # and `quick`: 30 minutes of two quiet cores
     python benchmarks/recipe_rows.py out/starter --tiny --out out/rows   # seconds for each row: a test of this program
 
 Every row has 30 minutes of one core. That is a number of steps: the minutes over the seconds of a step, which are
-measured once for all ways, in one run on quiet cores. So a row can be interrupted, and may be made beside others.
+measured once for all ways, in one run on quiet cores. So a row can be interrupted, and may be made beside others. A way
+that came later is measured beside one that is known: its seconds are those of the machine of the first run.
 Validation clips choose the recipe. Then it is compared with `quick` on the test clips, by the clock.
 """
 
@@ -92,6 +94,8 @@ WAYS = {
     "adam-slow": Way.of("long, Adam at 5e-4", **LONG | {"optimiser": "adam", "learning_rate": 5e-4}),
     "crop-48": Way.of("long, windows of 48 px", **LONG, crop=48),
     "crop-96": Way.of("long, windows of 96 px", **LONG, crop=96),
+    "crop-96-fast": Way.of("long, windows of 96 px, Muon at 6e-3", **LONG | {"learning_rate": 6e-3}, crop=96),
+    "crop-128": Way.of("long, windows of 128 px", **LONG, crop=128),
     "published-loss": Way.of("long, the published loss", **LONG, loss="published"),
     "paper-loss": Way.of("long, the loss of the paper's text", **LONG, loss="paper"),
     "log-mse": Way.of("long, the logarithm of the squared error", **LONG, loss="log-mse"),
@@ -169,7 +173,23 @@ def measure_speeds(args: argparse.Namespace) -> None:
                 taken[key].append(step.seconds())
                 print(f"{key}: {taken[key][-1]:.2f} s", flush=True)
     found = {key: statistics.median(times) for key, times in taken.items()}
-    write_json(args.out / SPEEDS, {"machine": machine(), "seconds": found})
+    path = args.out / SPEEDS
+    before = read_json(path) if path.exists() else {"machine": machine(), "seconds": {}}
+    write_json(path, before | {"seconds": joined(before["seconds"], found)})
+
+
+def joined(known: Mapping[str, float], found: Mapping[str, float]) -> dict[str, float]:
+    """Return known seconds with those of other steps, scaled by the steps that both measured.
+
+    `ValueError` if there are known ones, and none was measured again.
+    """
+    if not known:
+        return dict(found)
+    shared = [known[key] / seconds for key, seconds in found.items() if key in known]
+    if not shared:
+        raise ValueError(f"{SPEEDS} holds speeds of another run; add a way that it knows, as in --rows long,crop-128")
+    factor = statistics.median(shared)
+    return {key: seconds * factor for key, seconds in found.items()} | dict(known)
 
 
 def stages_of(names: list[str]) -> list[Values]:
@@ -273,7 +293,7 @@ def by_the_clock(name: str, seed: int, args: argparse.Namespace) -> None:
     path = args.out / f"{FINAL}{name}-{seed}.json"
     if path.exists():
         return
-    budget = Budget(minutes=0.02 if args.tiny else MINUTES, threads=2)
+    budget = Budget(minutes=0.02, threads=1) if args.tiny else Budget(minutes=MINUTES, threads=2)
     if not args.tiny:
         wait_for_quiet()
     watch = Watch.now()

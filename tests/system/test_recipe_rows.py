@@ -52,6 +52,14 @@ def test_every_way_has_the_same_time(tmp_path):
     assert recipe_rows.seconds_of({}, args) == 4.0
 
 
+def test_ways_that_came_later_are_measured_beside_known_ones():
+    known = {"a": 2.0, "b": 8.0}
+    assert recipe_rows.joined({}, known) == known
+    assert recipe_rows.joined(known, {"a": 4.0, "c": 6.0}) == {"a": 2.0, "b": 8.0, "c": 3.0}
+    with pytest.raises(ValueError, match="add a way that it knows"):
+        recipe_rows.joined(known, {"c": 6.0})
+
+
 def test_an_unknown_way_is_one_sentence(capsys):
     assert recipe_rows.main(["data", "--rows", "quick,quik"]) == 2
     assert capsys.readouterr().err.startswith("recipe_rows: no row is called 'quik'; known are quick, ")
