@@ -125,9 +125,9 @@ def write_page(out: Path) -> None:
         windows += each * last["step"]
         hours += last["elapsed"] / 3600
         rate = f"{part['settings']['learning_rate']:g}"
-        told = (number, last["step"], rate, f"{hours:.1f}", windows, f"{last['psnr_matched']:.2f}")
+        told = (number, part["processes"], last["step"], rate, f"{hours:.1f}", windows, f"{last['psnr_matched']:.2f}")
         lines.append([str(value) for value in told])
-    header = ("part", "steps", "rate", "hours so far", "windows so far", "validation [dB]")
+    header = ("part", "cores", "steps", "rate", "hours so far", "windows so far", "validation [dB]")
     figure = new_figure(6, 3.5)
     axes = figure.subplots()
     axes.semilogx(*zip(*points, strict=True), "o-")
@@ -138,8 +138,8 @@ def write_page(out: Path) -> None:
 
 Made by `python benchmarks/long_run.py {" ".join(f"out/{name}" for name in parts[-1]["data"])}`.
 
-`{NETWORK}` learns from rendered scenes at 2 to 26 photons and 3 bits, on {parts[-1]["processes"]} cores. The
-validation is the mean over all these lights.
+`{NETWORK}` learns from rendered scenes at 2 to 26 photons and 3 bits. The validation is the mean over all these
+lights. Hours are those of the clock, on as many cores as the table tells.
 
 {chr(10).join(markdown_table(lines, header))}
 
