@@ -37,6 +37,7 @@ import torch.nn.functional as functional
 from numpy import ndarray as Array
 from torch import Tensor
 
+from qsim.sensor.estimation import Response
 from qsim.sensor.sensor import Sensor
 from quiver.baselines.domain_tables import DomainTables, domain_tables
 from quiver.baselines.information_domain import InformationDomain, information_domain
@@ -397,6 +398,15 @@ def as_codes(codes: Array | Tensor, device: torch.device) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(small)).to(device, non_blocking=True)
 
 
+def frames_of_light(merged: Merged, response: Response) -> Tensor:
+    """Return how many frames tell the light of a pixel, float64 [B, H, W]: their weight, at most all of the window.
+
+    `ValueError` if all of them do not resolve the response; fewer are raised to what does.
+    """
+    response.cap(merged.frames)
+    return merged.weight.to(torch.float64).clamp(response.fewest, max(merged.frames, response.fewest))
+
+
 def restore(
     codes: Array,
     sensor: Sensor,
@@ -418,7 +428,7 @@ def restore(
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     height, width = codes.shape[1:]
     for i, merged in enumerate(stream(lambda t: codes[t], len(codes), domain, window, frames)):
-        table.cap(merged.frames)
-        mean_code, weight = (x[0, :height, :width].numpy() for x in (merged.mean_code, merged.weight))
-        restored[i] = table.invert(mean_code, np.clip(weight, table.fewest, max(merged.frames, table.fewest)))
+        pixels = (merged.mean_code, frames_of_light(merged, table))
+        mean_code, count = (x[0, :height, :width].numpy() for x in pixels)
+        restored[i] = table.invert(mean_code, count)
     return in_units(restored, photons_per_unit)

@@ -175,11 +175,9 @@ def _path_merge(codes: Tensor, sensor: Sensor, exposure: float, window: int, fra
     for merged in path_merge.stream(
         lambda t: codes[t], length, domain, window, frames, codes.device, together=together
     ):
-        light.response.cap(merged.frames)
-        mean_code, weight = (x[:, :height, :width] for x in (merged.mean_code, merged.weight))
-        fewest = light.response.fewest
-        samples = weight.to(torch.float64).clamp(fewest, max(merged.frames, fewest))
-        found[first : first + len(mean_code)] = light(mean_code, samples)
+        pixels = (merged.mean_code, path_merge.frames_of_light(merged, light.response))
+        mean_code, count = (x[:, :height, :width] for x in pixels)
+        found[first : first + len(mean_code)] = light(mean_code, count)
         first += len(mean_code)
     return found
 

@@ -155,6 +155,13 @@ def test_response_gives_the_light_of_a_mean_code_back(sensor: Sensor):
     light = np.linspace(0.2, 1.0, 5) * table.cap(100)
     np.testing.assert_allclose(table.invert(sensor.mean(light, EXPOSURE), 10**6), light, rtol=1e-4)
     assert table.invert(sensor.levels, 11) == table.cap(11) < table.photons[-1]
+    counts = np.array([[50.0, 100.0], [1000.0, 11.5]])  # of codes, pixel by pixel
+    np.testing.assert_array_equal(
+        table.invert(np.full((2, 2), sensor.levels, np.float32), counts), np.vectorize(table.cap)(counts)
+    )
+    for count in (0, -1, np.nan):
+        with pytest.raises(ValueError, match="samples is a number of codes above 0"):
+            table.cap(count)
 
 
 @pytest.mark.parametrize(

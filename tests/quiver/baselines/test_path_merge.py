@@ -318,12 +318,6 @@ def test_far_frames_count_where_a_place_rests(monkeypatch):
     assert count[:, 28:].mean() < 6.001
 
 
-def restored_by(codes, sensor, t, window, monkeypatch):
-    """Frame t of codes, merged with the frames of a window."""
-    monkeypatch.setattr(pm, "moved_window", window)
-    return pm.restore(codes, sensor, EXPOSURE, frames=range(t, t + 1))[0]
-
-
 def changed_by(seed, size, steps):
     """A third of the seeds each: 3 bits at 0.5 photons, 1 bit at 1 and at 0.4. Light [T, H, W] of blobs of `size` px
     that move by `steps`, its codes and the sensor.
